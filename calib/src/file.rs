@@ -1,0 +1,284 @@
+//! The rig file: raw TOML to a checked [`Rig`], every problem at once.
+
+use crate::{Camera, Eye, KeyProblem, Rectification, Rig, RigSigmas, unknown_keys};
+use emberfix_frames::{Metres, MountAngles, Vector, Vector3};
+use serde::Deserialize;
+use std::path::{Path, PathBuf};
+
+/// Why a rig file was refused.
+#[derive(Debug, thiserror::Error)]
+pub enum RigError {
+    /// The file can't be read.
+    #[error("rig {path}: {source}; an example is calib/rigs/oakd-75mm.toml", path = path.display())]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// Not TOML, or a value of the wrong type.
+    #[error("rig {path}: {message}", path = path.display())]
+    Syntax {
+        /// The file.
+        path: PathBuf,
+        /// What the TOML reader said.
+        message: String,
+    },
+    /// Values that no rig has, and keys that nothing reads.
+    #[error("rig {path}: {}", problems.join("; "), path = path.display())]
+    Values {
+        /// The file.
+        path: PathBuf,
+        /// One sentence per problem: key, value, allowed range, remedy.
+        problems: Vec<String>,
+    },
+    /// OpenCV can't rectify this geometry.
+    #[error("rig {path}: rectification failed: {source}", path = path.display())]
+    Rectify {
+        /// The file.
+        path: PathBuf,
+        /// What OpenCV said.
+        source: opencv::Error,
+    },
+}
+
+#[derive(Deserialize)]
+struct RawRig {
+    name: String,
+    left: RawCamera,
+    right: RawCamera,
+    stereo: RawStereo,
+    mount: RawMount,
+    time: RawTime,
+    sigma: RawSigma,
+}
+
+#[derive(Deserialize)]
+struct RawCamera {
+    image_size_px: [u32; 2],
+    focal_px: [f64; 2],
+    principal_point_px: [f64; 2],
+    distortion: Vec<f64>,
+}
+
+#[derive(Deserialize)]
+struct RawStereo {
+    right_from_left_rotation_deg: [f64; 3],
+    right_from_left_translation_m: [f64; 3],
+    max_skew_s: f64,
+}
+
+#[derive(Deserialize)]
+struct RawMount {
+    yaw_deg: f64,
+    depression_deg: f64,
+    roll_deg: f64,
+    lever_arm_m: [f64; 3],
+}
+
+#[derive(Deserialize)]
+struct RawTime {
+    camera_offset_s: f64,
+}
+
+#[derive(Deserialize)]
+struct RawSigma {
+    disparity_bias_px: f64,
+    boresight_deg: f64,
+    lever_arm_m: f64,
+    time_offset_s: f64,
+}
+
+const KNOWN: &[&str] = &[
+    "name",
+    "left.image_size_px",
+    "left.focal_px",
+    "left.principal_point_px",
+    "left.distortion",
+    "right.image_size_px",
+    "right.focal_px",
+    "right.principal_point_px",
+    "right.distortion",
+    "stereo.right_from_left_rotation_deg",
+    "stereo.right_from_left_translation_m",
+    "stereo.max_skew_s",
+    "mount.yaw_deg",
+    "mount.depression_deg",
+    "mount.roll_deg",
+    "mount.lever_arm_m",
+    "time.camera_offset_s",
+    "sigma.disparity_bias_px",
+    "sigma.boresight_deg",
+    "sigma.lever_arm_m",
+    "sigma.time_offset_s",
+];
+
+pub(crate) fn load(path: &Path) -> Result<Rig, RigError> {
+    let text = std::fs::read_to_string(path)
+        .map_err(|source| RigError::Read { path: path.to_owned(), source })?;
+    parse(&text, path)
+}
+
+pub(crate) fn parse(text: &str, path: &Path) -> Result<Rig, RigError> {
+    let syntax = |error: toml::de::Error| RigError::Syntax {
+        path: path.to_owned(),
+        message: error.to_string().trim_end().to_owned(),
+    };
+    let table: toml::Table = toml::from_str(text).map_err(syntax)?;
+    let unknown: Vec<String> =
+        unknown_keys(&table, KNOWN).iter().map(KeyProblem::to_string).collect();
+    let raw: RawRig = match toml::from_str(text) {
+        Ok(raw) => raw,
+        // A misspelt key is also a missing one: name the misspelling, it is what helps.
+        Err(_) if !unknown.is_empty() => return Err(values(path, unknown)),
+        Err(error) => return Err(syntax(error)),
+    };
+    let mut problems = unknown;
+    problems.extend(check(&raw));
+    if !problems.is_empty() {
+        return Err(values(path, problems));
+    }
+    build(raw, path)
+}
+
+fn values(path: &Path, problems: Vec<String>) -> RigError {
+    RigError::Values { path: path.to_owned(), problems }
+}
+
+/// Collects "key is value, allowed is range" for values out of range; NaN is always out.
+struct Checks(Vec<String>);
+
+impl Checks {
+    fn range(&mut self, key: &str, value: f64, low: f64, high: f64, hint: &str) {
+        if !(low..=high).contains(&value) {
+            self.0.push(format!("{key} is {value}, allowed is {low} to {high}{hint}"));
+        }
+    }
+}
+
+fn check(raw: &RawRig) -> Vec<String> {
+    let mut checks = Checks(Vec::new());
+    check_camera(&mut checks, "left", &raw.left);
+    check_camera(&mut checks, "right", &raw.right);
+    if raw.left.image_size_px != raw.right.image_size_px {
+        checks.0.push(format!(
+            "right.image_size_px is {:?}, left.image_size_px is {:?}; both eyes need one size",
+            raw.right.image_size_px, raw.left.image_size_px
+        ));
+    }
+    check_stereo(&mut checks, &raw.stereo);
+    check_mount(&mut checks, &raw.mount);
+    checks.range("time.camera_offset_s", raw.time.camera_offset_s, -2.0, 2.0, " (seconds)");
+    let sigma = &raw.sigma;
+    checks.range("sigma.disparity_bias_px", sigma.disparity_bias_px, 0.0, 20.0, "");
+    checks.range("sigma.boresight_deg", sigma.boresight_deg, 0.0, 45.0, "");
+    checks.range("sigma.lever_arm_m", sigma.lever_arm_m, 0.0, 5.0, "");
+    checks.range("sigma.time_offset_s", sigma.time_offset_s, 0.0, 2.0, "");
+    checks.0
+}
+
+fn check_camera(checks: &mut Checks, eye: &str, camera: &RawCamera) {
+    let [width, height] = camera.image_size_px.map(f64::from);
+    checks.range(&format!("{eye}.image_size_px[0]"), width, 64.0, 8192.0, "");
+    checks.range(&format!("{eye}.image_size_px[1]"), height, 64.0, 8192.0, "");
+    for (axis, focal) in camera.focal_px.iter().enumerate() {
+        checks.range(&format!("{eye}.focal_px[{axis}]"), *focal, 0.1 * width, 20.0 * width, " (pixels, not mm)");
+    }
+    let [cx, cy] = camera.principal_point_px;
+    checks.range(&format!("{eye}.principal_point_px[0]"), cx, 0.0, width - 1.0, "");
+    checks.range(&format!("{eye}.principal_point_px[1]"), cy, 0.0, height - 1.0, "");
+    if camera.distortion.len() != 5 {
+        checks.0.push(format!(
+            "{eye}.distortion has {} terms, needed are 5 (k1, k2, p1, p2, k3)",
+            camera.distortion.len()
+        ));
+    }
+    for (term, value) in camera.distortion.iter().enumerate() {
+        checks.range(&format!("{eye}.distortion[{term}]"), *value, -10.0, 10.0, "");
+    }
+}
+
+fn check_stereo(checks: &mut Checks, stereo: &RawStereo) {
+    for (axis, angle) in stereo.right_from_left_rotation_deg.iter().enumerate() {
+        let key = format!("stereo.right_from_left_rotation_deg[{axis}]");
+        checks.range(&key, *angle, -30.0, 30.0, " (degrees)");
+    }
+    let [x, y, z] = stereo.right_from_left_translation_m;
+    checks.range("stereo.max_skew_s", stereo.max_skew_s, 0.0, 0.1, " (seconds)");
+    if x > 0.0 {
+        checks.0.push(format!(
+            "stereo.right_from_left_translation_m[0] is {x}, allowed is below 0: the eyes are \
+             swapped, or the translation is that of left from right"
+        ));
+        return;
+    }
+    let baseline = Vector3::new(x, y, z).norm();
+    checks.range("stereo baseline", baseline, 0.005, 5.0, " (metres, not mm)");
+    checks.range("stereo.right_from_left_translation_m[1]", y, x, -x, " (eyes one above the other)");
+}
+
+fn check_mount(checks: &mut Checks, mount: &RawMount) {
+    checks.range("mount.yaw_deg", mount.yaw_deg, -180.0, 180.0, "");
+    checks.range("mount.depression_deg", mount.depression_deg, -90.0, 90.0, " (positive below the nose)");
+    checks.range("mount.roll_deg", mount.roll_deg, -180.0, 180.0, "");
+    for (axis, arm) in mount.lever_arm_m.iter().enumerate() {
+        checks.range(&format!("mount.lever_arm_m[{axis}]"), *arm, -20.0, 20.0, " (metres)");
+    }
+}
+
+fn build(raw: RawRig, path: &Path) -> Result<Rig, RigError> {
+    let (left, right) = (camera(&raw.left), camera(&raw.right));
+    let turn = Vector3::from(raw.stereo.right_from_left_rotation_deg).map(f64::to_radians);
+    let right_from_left =
+        emberfix_frames::UnitQuaternion::from_scaled_axis(turn).to_rotation_matrix().into_inner();
+    let translation_m = Vector3::from(raw.stereo.right_from_left_translation_m);
+    let rectification = Rectification::new(&left, &right, &right_from_left, &translation_m)
+        .map_err(|source| RigError::Rectify { path: path.to_owned(), source })?;
+    let turned_deg = rectification.turn_rad(Eye::Left).to_degrees();
+    if turned_deg > MAX_TURN_DEG {
+        let problem = format!(
+            "rectification turns the left eye by {turned_deg:.1} degrees, allowed is {MAX_TURN_DEG}; \
+             calibrate again: a rig whose eyes look along parallel axes needs less than one"
+        );
+        return Err(values(path, vec![problem]));
+    }
+    Ok(Rig {
+        name: raw.name,
+        left,
+        right,
+        right_from_left,
+        translation_m,
+        mount: MountAngles {
+            yaw_rad: raw.mount.yaw_deg.to_radians(),
+            depression_rad: raw.mount.depression_deg.to_radians(),
+            roll_rad: raw.mount.roll_deg.to_radians(),
+        },
+        lever_arm: Vector::from_metres(Vector3::from(raw.mount.lever_arm_m)),
+        time_offset_s: raw.time.camera_offset_s,
+        max_skew_s: raw.stereo.max_skew_s,
+        sigmas: RigSigmas {
+            disparity_bias_px: raw.sigma.disparity_bias_px,
+            boresight_rad: raw.sigma.boresight_deg.to_radians(),
+            lever_arm_m: raw.sigma.lever_arm_m,
+            time_offset_s: raw.sigma.time_offset_s,
+        },
+        rectification,
+    })
+}
+
+/// Beyond this a rig is bent or its calibration wrong (P4's printed rig turns by 6.9 degrees).
+const MAX_TURN_DEG: f64 = 3.0;
+
+fn camera(raw: &RawCamera) -> Camera {
+    let [width, height] = raw.image_size_px;
+    let mut distortion = [0.0; 5];
+    for (term, value) in distortion.iter_mut().zip(&raw.distortion) {
+        *term = *value;
+    }
+    Camera {
+        image_size_px: (width, height),
+        focal_px: (raw.focal_px[0], raw.focal_px[1]),
+        principal_point_px: (raw.principal_point_px[0], raw.principal_point_px[1]),
+        distortion,
+    }
+}

@@ -1,0 +1,85 @@
+//! Helpful words for keys that a configuration file should not have.
+
+/// One key that nothing reads.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct KeyProblem {
+    /// Full key, such as `left.focal_pix`.
+    pub key: String,
+    /// The known key that it resembles most, if any does.
+    pub nearest: Option<String>,
+}
+
+impl std::fmt::Display for KeyProblem {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "key {} is unknown", self.key)?;
+        match &self.nearest {
+            Some(nearest) => write!(f, "; did you mean {nearest}?"),
+            None => Ok(()),
+        }
+    }
+}
+
+/// The known key most like `key`, if it is like it at all.
+#[must_use]
+pub fn nearest_key<'a>(key: &str, known: &[&'a str]) -> Option<&'a str> {
+    known
+        .iter()
+        .map(|candidate| (strsim::jaro_winkler(key, candidate), *candidate))
+        .filter(|(likeness, _)| *likeness > 0.75)
+        .max_by(|a, b| a.0.total_cmp(&b.0))
+        .map(|(_, candidate)| candidate)
+}
+
+/// Every key of `table` that `known` does not list. A known key that ends in `.*` takes in
+/// everything beneath it; arrays of tables are looked through with the array's own name.
+#[must_use]
+pub fn unknown_keys(table: &toml::Table, known: &[&str]) -> Vec<KeyProblem> {
+    let mut found = Vec::new();
+    collect(table, "", known, &mut found);
+    found
+}
+
+fn collect(table: &toml::Table, prefix: &str, known: &[&str], found: &mut Vec<KeyProblem>) {
+    for (name, value) in table {
+        let key = format!("{prefix}{name}");
+        if known.contains(&format!("{key}.*").as_str()) {
+            continue;
+        }
+        match value {
+            toml::Value::Table(inner) if has_children(&key, known) => {
+                collect(inner, &format!("{key}."), known, found);
+            }
+            toml::Value::Array(items) if has_children(&key, known) => {
+                for inner in items.iter().filter_map(toml::Value::as_table) {
+                    collect(inner, &format!("{key}."), known, found);
+                }
+            }
+            _ if known.contains(&key.as_str()) => {}
+            _ => found.push(KeyProblem {
+                nearest: nearest_key(&key, known).map(str::to_owned),
+                key,
+            }),
+        }
+    }
+}
+
+fn has_children(key: &str, known: &[&str]) -> bool {
+    known.iter().any(|candidate| candidate.starts_with(&format!("{key}.")))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_misspelt_key_is_named_with_its_nearest() {
+        let table: toml::Table =
+            toml::from_str("[left]\nfocal_pix = 1\n[free]\nanything = 2").unwrap();
+        let problems = unknown_keys(&table, &["left.focal_px", "left.distortion", "free.*"]);
+        assert_eq!(problems.len(), 1);
+        assert_eq!(
+            problems[0].to_string(),
+            "key left.focal_pix is unknown; did you mean left.focal_px?"
+        );
+    }
+}

@@ -1,0 +1,1 @@
+"""Training project of the small fire and smoke detector `ember-nano.onnx`."""

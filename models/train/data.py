@@ -1,0 +1,310 @@
+"""Pictures in memory, the mix of samples and the augmentation.
+
+Boxes are rows (class, x1, y1, x2, y2) in px of the picture they belong to. A `valid` map at
+1/8 of the canvas says where a class may be judged: bit 0 fire, bit 1 smoke.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from numpy.random import Generator
+from torch.utils.data import IterableDataset
+
+from . import synth
+
+RGB_SETS = ("continuous_fire6", "abonia_cctv", "dfire_none99")
+GREY = 114
+
+
+@dataclass(slots=True)
+class Picture:
+    """One decoded picture: BGR uint8 [h, w, 3], its boxes, whether smoke is labelled, its clip."""
+
+    image: np.ndarray
+    boxes: np.ndarray
+    smoke: bool
+    clip: str
+    name: str
+
+
+def read_labels(path: Path, w: int, h: int) -> np.ndarray:
+    """YOLO text (class cx cy w h, 0..1) -> [n, 5] in px."""
+    text = path.read_text().split() if path.exists() else []
+    rows = np.array(text, np.float32).reshape(-1, 5)
+    out = rows.copy()
+    out[:, 1:3] = (rows[:, 1:3] - rows[:, 3:5] / 2) * (w, h)
+    out[:, 3:5] = (rows[:, 1:3] + rows[:, 3:5] / 2) * (w, h)
+    return out
+
+
+def read_split(root: Path, split: str, sets: tuple[str, ...] = RGB_SETS) -> list[Picture]:
+    """All pictures of one split of the fire data (root holds manifest.csv and splits/)."""
+    rows = {r["path"]: r for r in csv.DictReader((root / "manifest.csv").open())}
+    out = []
+    for line in (root / "splits" / f"{split}.txt").read_text().split():
+        if line.split("/")[0] not in sets:
+            continue
+        img = cv2.imread(str(root / line))
+        label = root / line.replace("/images/", "/labels/").replace(".jpg", ".txt")
+        row = rows[line]
+        boxes = read_labels(label, img.shape[1], img.shape[0])
+        out.append(Picture(img, boxes, row["smoke_labelled"] == "yes", row["cluster"], line))
+    return out
+
+
+def read_yolo(folder: Path) -> list[Picture]:
+    """A folder with images/*.jpg and labels/*.txt, both classes labelled."""
+    out = []
+    for path in sorted((folder / "images").glob("*.jpg")):
+        img = cv2.imread(str(path))
+        boxes = read_labels(folder / "labels" / f"{path.stem}.txt", img.shape[1], img.shape[0])
+        out.append(Picture(img, boxes, True, folder.name, f"{folder.name}/{path.name}"))
+    return out
+
+
+def draw(count: int, seed: int, cache: Path | None = None) -> list[Picture]:
+    """`count` procedural pictures; kept in `cache` (npz) between runs."""
+    if cache is not None and cache.exists():
+        with np.load(cache) as z:
+            images, boxes, ends = z["images"], z["boxes"], z["ends"]
+    else:
+        scenes = [synth.scene(np.random.default_rng([seed, i])) for i in range(count)]
+        images = np.stack([s[0] for s in scenes])
+        boxes = np.concatenate([s[1] for s in scenes])
+        ends = np.cumsum([len(s[1]) for s in scenes])
+        if cache is not None:
+            np.savez(cache, images=images, boxes=boxes, ends=ends)
+    parts = np.split(boxes, ends[:-1])
+    return [Picture(i, b, True, "synth", f"synth/{seed}/{k}") for k, (i, b) in enumerate(zip(images, parts))]
+
+
+def letterbox(image: np.ndarray, side: int) -> tuple[np.ndarray, float, int, int]:
+    """Fit into side x side with grey bars; returns picture, scale and left, top offset in px."""
+    h, w = image.shape[:2]
+    s = min(side / h, side / w)
+    nh, nw = round(h * s), round(w * s)
+    out = np.full((side, side, 3), GREY, np.uint8)
+    x, y = (side - nw) // 2, (side - nh) // 2
+    mode = cv2.INTER_AREA if s < 1 else cv2.INTER_LINEAR
+    out[y : y + nh, x : x + nw] = cv2.resize(image, (nw, nh), interpolation=mode)
+    return out, s, x, y
+
+
+class Canvas:
+    """A square picture under construction, side px (a multiple of 32), with boxes and validity."""
+
+    def __init__(self, side: int) -> None:
+        self.side = side
+        self.image = np.full((side, side, 3), GREY, np.uint8)
+        self.boxes: list[np.ndarray] = []
+        self.valid = np.full((side // 8, side // 8), 3, np.uint8)
+
+    def forbid(self, box: np.ndarray, bits: int) -> None:
+        """Stop judging the classes `bits` inside the box (px)."""
+        x1, y1, x2, y2 = np.clip(np.r_[np.floor(box[:2] / 8), np.ceil(box[2:] / 8)], 0, None).astype(int)
+        self.valid[y1 : y2 + 1, x1 : x2 + 1] &= 3 ^ bits
+
+    def place(self, p: Picture, scale: float, dx: float, dy: float, window: tuple[int, int, int, int]) -> None:
+        """Draw p scaled, its corner at (dx, dy), only inside window (x1, y1, x2, y2), all in px."""
+        x1, y1, x2, y2 = window
+        m = np.array([[scale, 0, dx - x1], [0, scale, dy - y1]], np.float32)
+        image = p.image
+        if scale < 0.6:  # area-average first, so that shrinking keeps small flames clean
+            image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+            m[0, 0] = m[1, 1] = 1
+        cv2.warpAffine(image, m, (x2 - x1, y2 - y1), self.image[y1:y2, x1:x2], cv2.INTER_LINEAR,
+                       cv2.BORDER_CONSTANT, (GREY, GREY, GREY))
+        if not p.smoke:
+            self.forbid(np.array(window, np.float32), 2)
+        for box in p.boxes:
+            full = box[1:] * scale + (dx, dy, dx, dy)
+            part = np.r_[np.maximum(full[:2], (x1, y1)), np.minimum(full[2:], (x2, y2))]
+            w, h = part[2:] - part[:2]
+            if w < 1 or h < 1:
+                continue
+            seen = w * h / np.prod(full[2:] - full[:2])
+            if seen < 0.25 or min(w, h) < 4:
+                self.forbid(part, 1 << int(box[0]))
+            else:
+                self.boxes.append(np.r_[box[0], part])
+
+
+def flame_cover(crop: np.ndarray) -> np.ndarray:
+    """How much each pixel of a labelled fire crop looks like flame, 0..1 [h, w] (red first, bright)."""
+    b, g, r = (crop[..., i].astype(np.float32) for i in range(3))
+    warm = np.clip((r - b) / 60, 0, 1) * np.clip((r - 110) / 70, 0, 1)
+    white = np.clip((np.minimum(r, g) - 195) / 40, 0, 1)
+    return cv2.GaussianBlur(np.maximum(warm, white), (0, 0), 0.8)
+
+
+class Mixer:
+    """Draws augmented training samples from the pools."""
+
+    def __init__(self, real: list[Picture], drawn: list[Picture], extra: list[Picture], side: int) -> None:
+        self.side = side
+        self.drawn, self.extra = drawn, extra
+        by_set: dict[str, dict[str, list[Picture]]] = defaultdict(lambda: defaultdict(list))
+        for p in real:
+            by_set[p.name.split("/")[0]][p.clip].append(p)
+        self.sets = [(name, list(clips.values())) for name, clips in by_set.items()]
+        weight = {"continuous_fire6": 0.7, "abonia_cctv": 0.2, "dfire_none99": 0.1}
+        self.set_p = np.array([weight.get(n, 0.1) for n, _ in self.sets])
+        self.set_p /= self.set_p.sum()
+        # Long clips count more than stills, but far less than by their length.
+        self.clip_p = [np.array([len(c) ** 0.4 for c in clips]) for _, clips in self.sets]
+        self.clip_p = [p / p.sum() for p in self.clip_p]
+        self.calm = [p for p in real + drawn if len(p.boxes) == 0 and p.smoke]
+        self.fires = [p for p in real if (p.boxes[:, 0] == 0).any() and not p.name.startswith("abonia")]
+
+    def real(self, rng: Generator) -> Picture:
+        i = rng.choice(len(self.sets), p=self.set_p)
+        clips = self.sets[i][1]
+        clip = clips[rng.choice(len(clips), p=self.clip_p[i])]
+        return clip[rng.integers(len(clip))]
+
+    def single(self, rng: Generator, c: Canvas, p: Picture, low: float, high: float) -> None:
+        """One picture, `low..high` times the canvas, anywhere that keeps part of it in view."""
+        h, w = p.image.shape[:2]
+        s = self.side / max(h, w) * np.exp(rng.uniform(np.log(low), np.log(high)))
+        room = np.array([self.side - w * s, self.side - h * s])
+        dx, dy = room * rng.uniform(0, 1, 2)
+        c.place(p, float(s), float(dx), float(dy), (0, 0, self.side, self.side))
+
+    def tile(self, rng: Generator, c: Canvas, p: Picture) -> None:
+        """A tile at about full resolution out of a large frame, as the service cuts it."""
+        s = float(np.exp(rng.uniform(np.log(0.75), np.log(1.5))))
+        h, w = p.image.shape[:2]
+        if len(p.boxes) and rng.random() < 0.7:
+            box = p.boxes[rng.integers(len(p.boxes)), 1:] * s
+            corner = (box[:2] + box[2:]) / 2 - rng.uniform(0.1, 0.9, 2) * self.side
+        else:
+            corner = rng.uniform(0, 1, 2) * np.maximum((w * s - self.side, h * s - self.side), 0)
+        corner = np.clip(corner, 0, np.maximum((w * s - self.side, h * s - self.side), 0))
+        c.place(p, s, float(-corner[0]), float(-corner[1]), (0, 0, self.side, self.side))
+
+    def mosaic(self, rng: Generator, c: Canvas) -> None:
+        """Four pictures around a random centre, so that objects get small."""
+        n = self.side
+        cx, cy = (rng.uniform(0.3, 0.7, 2) * n / 8).astype(int) * 8
+        for x1, y1, x2, y2 in ((0, 0, cx, cy), (cx, 0, n, cy), (0, cy, cx, n), (cx, cy, n, n)):
+            p = self.real(rng) if rng.random() < 0.75 or not self.drawn else self.drawn[rng.integers(len(self.drawn))]
+            h, w = p.image.shape[:2]
+            s = max((x2 - x1) / w, (y2 - y1) / h) * rng.uniform(0.7, 1.3)
+            dx = x1 + (x2 - x1 - w * s) * rng.uniform(0, 1)
+            dy = y1 + (y2 - y1 - h * s) * rng.uniform(0, 1)
+            c.place(p, float(s), float(dx), float(dy), (x1, y1, x2, y2))
+
+    def paste(self, rng: Generator, c: Canvas) -> None:
+        """Labelled flames, cut out by colour and shrunk to 7..120 px, onto a calm background."""
+        self.single(rng, c, self.calm[rng.integers(len(self.calm))], 1.0, 2.0)
+        for _ in range(int(rng.integers(1, 6))):
+            p = self.real(rng)
+            for _ in range(8):
+                if (p.boxes[:, 0] == 0).any() and not p.name.startswith("abonia"):
+                    break
+                p = self.real(rng)
+            else:
+                p = self.fires[rng.integers(len(self.fires))]
+            rows = p.boxes[p.boxes[:, 0] == 0]
+            x1, y1, x2, y2 = np.clip(rows[rng.integers(len(rows)), 1:], 0, None).astype(int)
+            crop = p.image[y1:y2, x1:x2]
+            if min(crop.shape[:2]) < 8:
+                continue
+            cover = flame_cover(crop)
+            if cover.mean() < 0.08:
+                continue
+            size = float(np.exp(rng.uniform(np.log(7), np.log(120)))) / max(crop.shape[:2])
+            mode = cv2.INTER_AREA if size < 1 else cv2.INTER_LINEAR
+            crop = cv2.resize(crop, None, fx=size, fy=size, interpolation=mode)
+            cover = cv2.resize(cover, crop.shape[1::-1], interpolation=mode)
+            if rng.random() < 0.5:
+                crop, cover = crop[:, ::-1], cover[:, ::-1]
+            h, w = cover.shape
+            if h >= self.side or w >= self.side or min(h, w) < 4:
+                continue
+            x, y = int(rng.integers(0, self.side - w)), int(rng.integers(0, self.side - h))
+            box = synth.extent(cover, 0.4)
+            if box is None or min(box[2:] - box[:2]) < 4:
+                continue
+            view = c.image[y : y + h, x : x + w]
+            mix = np.clip(cover * 1.3, 0, 1)[..., None]
+            view[:] = (view * (1 - mix) + crop * mix).astype(np.uint8)
+            c.boxes.append(np.r_[0, box + (x, y, x, y)])
+
+    def sample(self, rng: Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Picture [side, side, 3] uint8 BGR, boxes [n, 5] px, valid [side/8, side/8] uint8."""
+        c = Canvas(self.side)
+        kind = rng.random()
+        if self.extra and kind < 0.22:
+            p = self.extra[rng.integers(len(self.extra))]
+            self.tile(rng, c, p) if rng.random() < 0.75 else self.single(rng, c, p, 0.9, 1.3)
+        elif kind < (0.34 if self.extra else 0.2) and self.drawn:
+            self.single(rng, c, self.drawn[rng.integers(len(self.drawn))], 0.7, 1.6)
+        elif kind < (0.46 if self.extra else 0.35):
+            self.paste(rng, c)
+        elif kind < (0.60 if self.extra else 0.55):
+            self.mosaic(rng, c)
+        else:
+            self.single(rng, c, self.real(rng), 0.5, 1.45)
+        img = photometric(rng, c.image)
+        boxes = np.array(c.boxes, np.float32).reshape(-1, 5)
+        valid = c.valid
+        if rng.random() < 0.5:
+            # Cell (i) looks at px 8 i, so the flipped map is off by less than one cell.
+            img, valid = img[:, ::-1], valid[:, ::-1]
+            boxes[:, [1, 3]] = self.side - boxes[:, [3, 1]]
+        return np.ascontiguousarray(img), boxes, np.ascontiguousarray(valid)
+
+
+def photometric(rng: Generator, img: np.ndarray) -> np.ndarray:
+    """Brightness, contrast, hue, saturation, blur, noise and JPEG damage; uint8 in and out."""
+    if rng.random() < 0.5:
+        hsv = cv2.cvtColor(img, cv2.COLOR_BGR2HSV)
+        hue = (np.arange(256) + rng.integers(-5, 6)) % 180
+        sat = np.clip(np.arange(256) * rng.uniform(0.6, 1.4), 0, 255)
+        val = np.clip(np.arange(256) * rng.uniform(0.65, 1.35), 0, 255)
+        table = np.stack((hue, sat, val), -1).astype(np.uint8)[None]
+        img = cv2.cvtColor(cv2.LUT(hsv, table), cv2.COLOR_HSV2BGR)
+    if rng.random() < 0.4:
+        ramp = np.arange(256) / 255
+        ramp = ramp ** np.exp(rng.uniform(-0.4, 0.4)) * rng.uniform(0.85, 1.15) + rng.uniform(-0.06, 0.06)
+        img = cv2.LUT(img, np.clip(ramp * 255, 0, 255).astype(np.uint8))
+    if rng.random() < 0.2:
+        img = cv2.GaussianBlur(img, (0, 0), rng.uniform(0.4, 1.6))
+    if rng.random() < 0.15:
+        grain = rng.integers(-12, 13, img.shape, dtype=np.int16)
+        img = np.clip(img + grain, 0, 255).astype(np.uint8)
+    if rng.random() < 0.3:
+        ok, data = cv2.imencode(".jpg", img, (cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(30, 90))))
+        img = cv2.imdecode(data, cv2.IMREAD_COLOR)
+    return img
+
+
+class Batches(IterableDataset):
+    """Endless seeded batches: images [B, 3, S, S] uint8, boxes [B, M, 5] (class -1 = none), valid."""
+
+    def __init__(self, mixer: Mixer, batch: int, seed: int, start: int = 0) -> None:
+        self.mixer, self.batch, self.seed, self.start = mixer, batch, seed, start
+
+    def __iter__(self) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
+        cv2.setNumThreads(0)
+        info = torch.utils.data.get_worker_info()
+        step, stride = self.start + (info.id if info else 0), info.num_workers if info else 1
+        while True:
+            rng = np.random.default_rng([self.seed, step])
+            samples = [self.mixer.sample(rng) for _ in range(self.batch)]
+            most = max(1, max(len(s[1]) for s in samples))
+            boxes = np.full((self.batch, most, 5), -1, np.float32)
+            for i, s in enumerate(samples):
+                boxes[i, : len(s[1])] = s[1]
+            images = torch.from_numpy(np.stack([s[0] for s in samples])).permute(0, 3, 1, 2)
+            yield images, torch.from_numpy(boxes), torch.from_numpy(np.stack([s[2] for s in samples]))
+            step += stride

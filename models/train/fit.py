@@ -1,0 +1,185 @@
+"""Train EmberNano on the CPU: seeded, resumable, with a progress bar and curves.
+
+    python -m train.fit --data ../../shared/data/fire --out OUT [--extra DIR ...]
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import json
+import math
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from . import data, metrics
+from .loss import losses
+from .model import INPUT, MEAN, STD, EmberNano, cells, decode
+
+
+def normalise(images: Tensor) -> Tensor:
+    """uint8 [B, 3, H, W] BGR -> float32, channels last."""
+    mean, std = torch.tensor(MEAN).view(1, 3, 1, 1), torch.tensor(STD).view(1, 3, 1, 1)
+    return ((images.float() - mean) / std).contiguous(memory_format=torch.channels_last)
+
+
+@torch.no_grad()
+def detect(model: EmberNano, pictures: list[data.Picture], side: int = INPUT, batch: int = 16) -> list[metrics.Found]:
+    """Detections in the px of each picture, letterboxed to side x side."""
+    model.eval()
+    centres, strides = cells(side, side)
+    out: list[metrics.Found] = []
+    for i in range(0, len(pictures), batch):
+        fitted = [data.letterbox(p.image, side) for p in pictures[i : i + batch]]
+        images = torch.from_numpy(np.stack([f[0] for f in fitted])).permute(0, 3, 1, 2)
+        y = model(normalise(images))
+        boxes = decode(y[..., model.nc :], centres, strides).numpy()
+        for f, s, b in zip(fitted, y[..., : model.nc].numpy(), boxes):
+            found = metrics.unpack(s, b)
+            found.boxes = (found.boxes - (f[2], f[3], f[2], f[3])) / f[1]
+            out.append(found)
+    return out
+
+
+def fire_ap(found: list[metrics.Found], pictures: list[data.Picture]) -> float:
+    return metrics.average_precision(*metrics.match(found, [p.boxes for p in pictures], 0))
+
+
+def thin(pictures: list[data.Picture], most: int) -> list[data.Picture]:
+    """At most `most` pictures, evenly spaced."""
+    return [pictures[i] for i in np.linspace(0, len(pictures) - 1, min(most, len(pictures))).astype(int)]
+
+
+def curves(rows: list[dict[str, float]], path: Path) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    fig, axes = plt.subplots(1, 2, figsize=(10, 4))
+    for k in ("qfl", "dfl", "giou"):
+        axes[0].plot([r["step"] for r in rows], [r[k] for r in rows], label=k)
+    seen = [r for r in rows if "val" in r]
+    for k in ("val", "synth", "extra"):
+        if seen and k in seen[0]:
+            axes[1].plot([r["step"] for r in seen], [r[k] for r in seen], label=f"fire AP50 {k}")
+    for a in axes:
+        a.set_xlabel("step"), a.legend(), a.grid(alpha=0.3)
+    fig.tight_layout()
+    fig.savefig(path)
+    plt.close(fig)
+
+
+def main() -> None:
+    ap = argparse.ArgumentParser(description=__doc__)
+    ap.add_argument("--data", type=Path, required=True, help="folder with manifest.csv and splits/")
+    ap.add_argument("--out", type=Path, required=True, help="outside the project: checkpoints, log, curves")
+    ap.add_argument("--extra", type=Path, action="append", default=[], help="more YOLO folders, e.g. simulated frames")
+    ap.add_argument("--init", type=Path, help="start from the EMA weights of this checkpoint")
+    ap.add_argument("--steps", type=int, default=6000)
+    ap.add_argument("--minutes", type=float, default=1e9, help="the schedule ends by then even if steps remain")
+    ap.add_argument("--batch", type=int, default=24)
+    ap.add_argument("--side", type=int, default=320, help="px of the training canvas, a multiple of 32")
+    ap.add_argument("--lr", type=float, default=2e-3)
+    ap.add_argument("--drawn", type=int, default=1500, help="procedural pictures")
+    ap.add_argument("--every", type=int, default=300, help="steps between validations")
+    ap.add_argument("--seed", type=int, default=1)
+    ap.add_argument("--threads", type=int, default=2)
+    ap.add_argument("--workers", type=int, default=1)
+    args = ap.parse_args()
+    torch.manual_seed(args.seed)
+    torch.set_num_threads(args.threads)
+    args.out.mkdir(parents=True, exist_ok=True)
+    started = time.monotonic()
+
+    real = data.read_split(args.data, "train")
+    val = data.read_split(args.data, "val")
+    drawn = data.draw(args.drawn, args.seed, args.out.parent / f"drawn-{args.seed}-{args.drawn}.npz") if args.drawn else []
+    check = data.draw(60, 10_000, args.out.parent / "drawn-check.npz")
+    extra = [p for d in args.extra for p in data.read_yolo(d)]
+    extra, extra_check = [p for i, p in enumerate(extra) if i % 12], extra[::12]
+    print(f"train {len(real)}, drawn {len(drawn)}, extra {len(extra)}, val {len(val)}", flush=True)
+
+    model = EmberNano().to(memory_format=torch.channels_last)
+    decay = [p for p in model.parameters() if p.ndim > 1]
+    plain = [p for p in model.parameters() if p.ndim <= 1]
+    groups = [{"params": decay, "weight_decay": 0.02}, {"params": plain, "weight_decay": 0.0}]
+    optimiser = torch.optim.AdamW(groups, lr=args.lr, betas=(0.9, 0.99))
+    step, spent, best, rows = 0, 0.0, -1.0, []
+    last = args.out / "last.pt"
+    if last.exists():
+        state = torch.load(last, map_location="cpu", weights_only=True)
+        model.load_state_dict(state["model"])
+        optimiser.load_state_dict(state["optimiser"])
+        step, spent, best, rows = state["step"], state["spent"], state["best"], json.loads(state["rows"])
+    elif args.init:
+        model.load_state_dict(torch.load(args.init, map_location="cpu", weights_only=True)["ema"])
+    ema = copy.deepcopy(model).eval()
+    if last.exists():
+        ema.load_state_dict(state["ema"])
+
+    mixer = data.Mixer(real, drawn, extra, args.side)
+    loader = torch.utils.data.DataLoader(
+        data.Batches(mixer, args.batch, args.seed, step), batch_size=None, num_workers=args.workers,
+        prefetch_factor=4 if args.workers else None,
+    )
+    batches = iter(loader)
+    began = time.monotonic() - spent
+    bar = tqdm(total=args.steps, initial=step, mininterval=20)
+    sums: dict[str, float] = {}
+    since = 0
+    done = 0.0
+    while done < 1.0:
+        images, boxes, valid = next(batches)
+        spent = time.monotonic() - began
+        done = max((step + 1) / args.steps, spent / 60 / args.minutes)
+        rate = args.lr * min(1.0, (step + 1) / 200) * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * min(done, 1))))
+        for g in optimiser.param_groups:
+            g["lr"] = rate
+        model.train()
+        out = model.logits(normalise(images))
+        parts = losses(out, boxes, valid, model.nc, args.side, args.side)
+        optimiser.zero_grad()
+        parts["total"].backward()
+        nn.utils.clip_grad_norm_(model.parameters(), 10.0)
+        optimiser.step()
+        step += 1
+        keep = min(0.998, step / (step + 20))
+        with torch.no_grad():
+            for e, m in zip(ema.state_dict().values(), model.state_dict().values()):
+                e.lerp_(m, 1 - keep) if e.is_floating_point() else e.copy_(m)
+        for k, v in parts.items():
+            sums[k] = sums.get(k, 0.0) + float(v)
+        since += 1
+        bar.update()
+        if step % args.every == 0 or done >= 1.0:
+            row = {"step": step, "minutes": spent / 60, "lr": rate} | {k: v / since for k, v in sums.items()}
+            sums, since = {}, 0
+            pool = val if done >= 1.0 else thin(val, 150)
+            row["val"] = fire_ap(detect(ema, pool), pool)
+            row["synth"] = fire_ap(detect(ema, check), check)
+            if extra_check:
+                row["extra"] = fire_ap(detect(ema, thin(extra_check, 40), 640), thin(extra_check, 40))
+            rows.append(row)
+            print("\n" + " ".join(f"{k} {v:.4g}" for k, v in row.items()), flush=True)
+            curves(rows, args.out / "curves.png")
+            state = {"model": model.state_dict(), "ema": ema.state_dict(), "optimiser": optimiser.state_dict(),
+                     "step": step, "spent": spent, "seed": args.seed, "rows": json.dumps(rows)}
+            better = row["val"] >= best
+            best = max(best, row["val"])
+            state["best"] = best
+            torch.save(state, last.with_suffix(".tmp"))
+            last.with_suffix(".tmp").replace(last)
+            if better:
+                torch.save({"ema": ema.state_dict(), "seed": args.seed, "step": step}, args.out / "best.pt")
+    bar.close()
+    print(f"done in {(time.monotonic() - started) / 60:.1f} min, best val fire AP50 {best:.3f}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,137 @@
+"""EmberNano: a small one-stage detector that speaks the NanoDet-Plus tensor contract.
+
+Input  [B, 3, H, W] float32, BGR, normalised with MEAN and STD (pixel values 0..255).
+Output [B, cells, nc + 32]: nc class scores (sigmoid) and 4 sides x 8 bins of distance
+logits (left, top, right, bottom; unit: stride). The centre of a cell is index * stride.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+NAMES = ("fire", "smoke")
+STRIDES = (8, 16, 32, 64)
+BINS = 8  # distance = stride * sum(softmax(logits) * 0..7)
+INPUT = 416  # px, side of the square input
+MEAN = (103.53, 116.28, 123.675)  # B, G, R
+STD = (57.375, 57.12, 58.395)
+
+
+def conv(cin: int, cout: int, k: int = 1, s: int = 1, groups: int = 1, act: bool = True) -> nn.Sequential:
+    """Convolution, batch norm and (by default) leaky ReLU; keeps H, W when s is 1."""
+    layers: list[nn.Module] = [
+        nn.Conv2d(cin, cout, k, s, k // 2, groups=groups, bias=False),
+        nn.BatchNorm2d(cout, momentum=0.03, eps=1e-3),
+    ]
+    if act:
+        layers.append(nn.LeakyReLU(0.1, inplace=True))
+    return nn.Sequential(*layers)
+
+
+def separable(cin: int, cout: int, k: int = 3, s: int = 1) -> nn.Sequential:
+    """Depthwise k x k followed by pointwise 1 x 1."""
+    return nn.Sequential(conv(cin, cin, k, s, groups=cin, act=False), conv(cin, cout))
+
+
+class Residual(nn.Module):
+    """Inverted residual: 1x1 widen, depthwise 3x3, 1x1 project; skip when the shape is kept."""
+
+    def __init__(self, cin: int, cout: int, s: int = 1, widen: int = 2) -> None:
+        super().__init__()
+        mid = cin * widen
+        self.skip = s == 1 and cin == cout
+        self.body = nn.Sequential(
+            conv(cin, mid), conv(mid, mid, 3, s, groups=mid, act=False), conv(mid, cout, act=False)
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        y = self.body(x)
+        return x + y if self.skip else nn.functional.leaky_relu(y, 0.1)
+
+
+class Pooling(nn.Module):
+    """Fast spatial pyramid: three chained 5x5 max pools, so large flames see their surroundings."""
+
+    def __init__(self, c: int) -> None:
+        super().__init__()
+        self.reduce = conv(c, c // 2)
+        self.pool = nn.MaxPool2d(5, 1, 2)
+        self.merge = conv(c * 2, c)
+
+    def forward(self, x: Tensor) -> Tensor:
+        a = self.reduce(x)
+        b = self.pool(a)
+        c = self.pool(b)
+        return self.merge(torch.cat((a, b, c, self.pool(c)), 1))
+
+
+class Head(nn.Module):
+    """Score and distance prediction of one level: [B, C, h, w] -> scores nc, distances 32."""
+
+    def __init__(self, c: int, nc: int) -> None:
+        super().__init__()
+        self.cls = nn.Sequential(separable(c, c), nn.Conv2d(c, nc, 1))
+        self.reg = nn.Sequential(separable(c, c), nn.Conv2d(c, 4 * BINS, 1))
+        nn.init.normal_(self.cls[1].weight, std=0.01)
+        nn.init.constant_(self.cls[1].bias, -4.6)  # sigmoid = 0.01 at the start
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.cat((self.cls(x), self.reg(x)), 1)
+
+
+class EmberNano(nn.Module):
+    """Backbone (strides 2..32), PAN neck with one extra level (64), and a head per level."""
+
+    def __init__(self, nc: int = len(NAMES), neck: int = 64) -> None:
+        super().__init__()
+        self.stem = nn.Sequential(conv(3, 16, 3, 2), separable(16, 24, 3, 2))
+        self.stage8 = nn.Sequential(Residual(24, 48, 2), Residual(48, 48), Residual(48, 48))
+        self.stage16 = nn.Sequential(Residual(48, 96, 2), *(Residual(96, 96) for _ in range(3)))
+        self.stage32 = nn.Sequential(Residual(96, 160, 2), Residual(160, 160), Pooling(160))
+        self.lateral = nn.ModuleList(conv(c, neck) for c in (48, 96, 160))
+        self.up = nn.ModuleList(separable(2 * neck, neck) for _ in range(2))
+        self.down = nn.ModuleList(separable(neck, neck, 3, 2) for _ in range(2))
+        self.fuse = nn.ModuleList(separable(2 * neck, neck) for _ in range(2))
+        self.extra = separable(neck, neck, 3, 2)
+        self.heads = nn.ModuleList(Head(neck, nc) for _ in STRIDES)
+        self.nc = nc
+
+    def levels(self, x: Tensor) -> list[Tensor]:
+        """Raw maps per stride: [B, nc + 32, h, w] with scores still as logits."""
+        c8 = self.stage8(self.stem(x))
+        c16 = self.stage16(c8)
+        c32 = self.stage32(c16)
+        p8, p16, p32 = (m(c) for m, c in zip(self.lateral, (c8, c16, c32)))
+        t16 = self.up[0](torch.cat((p16, nn.functional.interpolate(p32, scale_factor=2.0)), 1))
+        o8 = self.up[1](torch.cat((p8, nn.functional.interpolate(t16, scale_factor=2.0)), 1))
+        o16 = self.fuse[0](torch.cat((t16, self.down[0](o8)), 1))
+        o32 = self.fuse[1](torch.cat((p32, self.down[1](o16)), 1))
+        return [h(o) for h, o in zip(self.heads, (o8, o16, o32, self.extra(o32)))]
+
+    def logits(self, x: Tensor) -> Tensor:
+        """[B, cells, nc + 32], scores as logits, cells row-major in stride order."""
+        return torch.cat([m.flatten(2) for m in self.levels(x)], 2).transpose(1, 2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        out = self.logits(x)
+        return torch.cat((out[..., : self.nc].sigmoid(), out[..., self.nc :]), 2)
+
+
+def cells(height: int, width: int) -> tuple[Tensor, Tensor]:
+    """Cell centres [cells, 2] (x, y in px) and strides [cells] of an input of that size."""
+    centres, strides = [], []
+    h, w = height // 8, width // 8
+    for s in STRIDES:
+        y, x = torch.meshgrid(torch.arange(h), torch.arange(w), indexing="ij")
+        centres.append(torch.stack((x, y), -1).reshape(-1, 2) * float(s))
+        strides.append(torch.full((h * w,), float(s)))
+        h, w = (h + 1) // 2, (w + 1) // 2
+    return torch.cat(centres), torch.cat(strides)
+
+
+def decode(distances: Tensor, centres: Tensor, strides: Tensor) -> Tensor:
+    """Distance logits [..., cells, 32] -> boxes [..., cells, 4] (x1, y1, x2, y2 in input px)."""
+    bins = torch.arange(BINS, dtype=distances.dtype)
+    side = (distances.unflatten(-1, (4, BINS)).softmax(-1) @ bins) * strides[:, None]
+    return torch.cat((centres - side[..., :2], centres + side[..., 2:]), -1)

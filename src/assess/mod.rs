@@ -1,0 +1,1 @@
+//! How a fire changes: size in metres, intensity, trend. Pure: no I/O, no clock.
