@@ -1,0 +1,1 @@
+//! What is there: terrain, fires, smoke, lookalikes.
