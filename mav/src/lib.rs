@@ -19,6 +19,7 @@
 
 pub mod outgoing;
 pub mod telemetry;
+pub mod tlog;
 pub mod wire;
 
 pub use outgoing::{EncodeError, Encoder, MavMessage};
