@@ -23,3 +23,6 @@ pub mod pose;
 pub mod range;
 pub mod record;
 pub mod track;
+
+#[cfg(test)]
+mod testing;
