@@ -1,6 +1,6 @@
 //! The rig file: raw TOML to a checked [`Rig`], every problem at once.
 
-use crate::{Camera, Eye, KeyProblem, Rectification, Rig, RigSigmas, unknown_keys};
+use crate::{Camera, Checks, Eye, KeyProblem, Rectification, Rig, RigSigmas, unknown_keys};
 use emberfix_frames::{Metres, MountAngles, Vector, Vector3};
 use serde::Deserialize;
 use std::path::{Path, PathBuf};
@@ -145,23 +145,12 @@ fn values(path: &Path, problems: Vec<String>) -> RigError {
     RigError::Values { path: path.to_owned(), problems }
 }
 
-/// Collects "key is value, allowed is range" for values out of range; NaN is always out.
-struct Checks(Vec<String>);
-
-impl Checks {
-    fn range(&mut self, key: &str, value: f64, low: f64, high: f64, hint: &str) {
-        if !(low..=high).contains(&value) {
-            self.0.push(format!("{key} is {value}, allowed is {low} to {high}{hint}"));
-        }
-    }
-}
-
 fn check(raw: &RawRig) -> Vec<String> {
-    let mut checks = Checks(Vec::new());
+    let mut checks = Checks::new();
     check_camera(&mut checks, "left", &raw.left);
     check_camera(&mut checks, "right", &raw.right);
     if raw.left.image_size_px != raw.right.image_size_px {
-        checks.0.push(format!(
+        checks.problem(format!(
             "right.image_size_px is {:?}, left.image_size_px is {:?}; both eyes need one size",
             raw.right.image_size_px, raw.left.image_size_px
         ));
@@ -174,7 +163,7 @@ fn check(raw: &RawRig) -> Vec<String> {
     checks.range("sigma.boresight_deg", sigma.boresight_deg, 0.0, 45.0, "");
     checks.range("sigma.lever_arm_m", sigma.lever_arm_m, 0.0, 5.0, "");
     checks.range("sigma.time_offset_s", sigma.time_offset_s, 0.0, 2.0, "");
-    checks.0
+    checks.into_problems()
 }
 
 fn check_camera(checks: &mut Checks, eye: &str, camera: &RawCamera) {
@@ -188,7 +177,7 @@ fn check_camera(checks: &mut Checks, eye: &str, camera: &RawCamera) {
     checks.range(&format!("{eye}.principal_point_px[0]"), cx, 0.0, width - 1.0, "");
     checks.range(&format!("{eye}.principal_point_px[1]"), cy, 0.0, height - 1.0, "");
     if camera.distortion.len() != 5 {
-        checks.0.push(format!(
+        checks.problem(format!(
             "{eye}.distortion has {} terms, needed are 5 (k1, k2, p1, p2, k3)",
             camera.distortion.len()
         ));
@@ -206,7 +195,7 @@ fn check_stereo(checks: &mut Checks, stereo: &RawStereo) {
     let [x, y, z] = stereo.right_from_left_translation_m;
     checks.range("stereo.max_skew_s", stereo.max_skew_s, 0.0, 0.1, " (seconds)");
     if x > 0.0 {
-        checks.0.push(format!(
+        checks.problem(format!(
             "stereo.right_from_left_translation_m[0] is {x}, allowed is below 0: the eyes are \
              swapped, or the translation is that of left from right"
         ));

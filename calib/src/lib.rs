@@ -12,7 +12,7 @@ mod nearest;
 mod rectify;
 
 pub use file::RigError;
-pub use nearest::{KeyProblem, nearest_key, unknown_keys};
+pub use nearest::{Checks, KeyProblem, nearest_key, unknown_keys};
 pub use rectify::Rectification;
 
 use emberfix_frames::{

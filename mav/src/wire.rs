@@ -280,6 +280,21 @@ pub struct WireCounters {
     pub undecodable: u64,
 }
 
+impl WireCounters {
+    /// Both together.
+    #[must_use]
+    pub fn plus(self, other: Self) -> Self {
+        Self {
+            frames: self.frames + other.frames,
+            garbage_bytes: self.garbage_bytes + other.garbage_bytes,
+            shed_bytes: self.shed_bytes + other.shed_bytes,
+            crc: self.crc + other.crc,
+            unknown_id: self.unknown_id + other.unknown_id,
+            undecodable: self.undecodable + other.undecodable,
+        }
+    }
+}
+
 /// Finds frames in a byte stream; sans-IO.
 ///
 /// A candidate that fails is searched again from its second byte, so that a damaged or truncated

@@ -79,6 +79,20 @@ impl AlarmDesk {
         due
     }
 
+    /// The id that a fire has in alarms.
+    #[must_use]
+    pub fn id(&self, fire: FireId) -> String {
+        format!("{}-{}", self.uav, fire.0)
+    }
+
+    /// A sighting's Feature with the aircraft's name and the fire's id.
+    #[must_use]
+    pub fn signed(&self, fire: Option<FireId>, mut feature: serde_json::Value) -> serde_json::Value {
+        feature["properties"]["uav"] = self.uav.clone().into();
+        feature["properties"]["fire"] = fire.map(|fire| self.id(fire)).into();
+        feature
+    }
+
     fn is_due(
         &self,
         fire: &Fire,
@@ -114,7 +128,7 @@ impl AlarmDesk {
         Alarm {
             place,
             properties: AlarmProperties {
-                id: format!("{}-{}", self.uav, fire.id.0),
+                id: self.id(fire.id),
                 revision,
                 uav: self.uav.clone(),
                 class: fire.class,
