@@ -64,7 +64,9 @@ fn collect(table: &toml::Table, prefix: &str, known: &[&str], found: &mut Vec<Ke
 }
 
 fn has_children(key: &str, known: &[&str]) -> bool {
-    known.iter().any(|candidate| candidate.starts_with(&format!("{key}.")))
+    known
+        .iter()
+        .any(|candidate| candidate.starts_with(&format!("{key}.")))
 }
 
 #[cfg(test)]
