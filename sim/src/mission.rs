@@ -6,6 +6,7 @@
 use crate::autopilot::{AutopilotConfig, ErrorsConfig};
 use crate::earth::Lla;
 use crate::flight::{FlightConfig, PathConfig};
+use crate::world::WorldConfig;
 use emberfix_calib::{Rig, RigError};
 use emberfix_frames::ServiceTime;
 use serde::Deserialize;
@@ -88,7 +89,7 @@ pub struct SimConfig {
     #[serde(default)]
     pub errors: ErrorsConfig,
     /// What is there.
-    pub world: toml::Table,
+    pub world: WorldConfig,
 }
 
 /// `[sim.camera]`.
