@@ -1,1 +1,3 @@
-//! deliver
+//! The durable outbox and one file per link.
+
+pub mod http;
