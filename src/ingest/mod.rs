@@ -33,7 +33,7 @@ mod url;
 
 pub use blocks::RECORD_LIMIT_BYTES;
 pub use camera::CaptureClock;
-pub use decode::{DecodeError, EyeHealth, EyeWatch};
+pub use decode::{DecodeError, EyeHealth, EyeWatch, ImageDecoder};
 pub use live::LatestPair;
 pub use mcap_stream::{McapStream, StreamEvent};
 pub use messages::{CalibrationMismatch, StatedCalibration};

@@ -8,7 +8,9 @@ use crate::ingest::ServiceClock;
 use crate::pipeline::{Event, Output, Pipeline};
 use crate::pose::Pose;
 use crate::record::{BodyPose, Recorder, UavFix};
-use emberfix_frames::{Covariance, ServiceTime, VehicleEnu, Wgs84Parts};
+use emberfix_frames::{
+    Covariance, ServiceTime, UnitQuaternion, Wgs84, Wgs84Parts, enu_offset,
+};
 use emberfix_mav::Received;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
@@ -36,6 +38,7 @@ pub struct Core {
     pub board: Arc<Board>,
     pub clock: ServiceClock,
     pub uav: String,
+    pub datum: Wgs84,
 }
 
 /// How long the thread sleeps when nothing comes.
@@ -119,15 +122,21 @@ impl Core {
             longitude_deg: pose.place.longitude_deg(),
             height_ellipsoid_m: pose.place.height().m(),
             heading_deg: Some(heading_deg),
-            health: if health.is_empty() { None } else { Some(health.join("; ")) },
+            health: if health.is_empty() { "ok".to_owned() } else { health.join("; ") },
         });
         if let Some(recorder) = &self.recorder {
             let (h, v) = (pose.gnss_horizontal_m, pose.gnss_vertical_m);
-            let covariance = Covariance::<VehicleEnu>::from_sigmas_m(h, h, v);
-            recorder.write_uav_fix(pose.at, &UavFix { place: pose.place, covariance });
+            let covariance = Covariance::from_sigmas_m(h, h, v);
+            let heading_rad = Some(pose.attitude.angles().2);
+            recorder.write_uav_fix(pose.at, &UavFix { place: pose.place, covariance, heading_rad });
+            let (w, i, j, k) = pose.attitude.enu_from_body().to_quaternion();
+            let quaternion = nalgebra::Quaternion::new(w, i, j, k);
             recorder.write_body_pose(
                 pose.at,
-                &BodyPose { place: pose.place, attitude: pose.attitude },
+                &BodyPose {
+                    position_enu_m: enu_offset(&self.datum, &pose.place),
+                    enu_from_body: UnitQuaternion::new_normalize(quaternion),
+                },
             );
         }
     }

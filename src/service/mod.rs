@@ -191,6 +191,7 @@ pub async fn run(
         board: Arc::clone(&board),
         clock: Arc::clone(&clock),
         uav: mission.uav.clone(),
+        datum: mission.datum,
     };
     let working = core::start(worker, inbox, slot).map_err(thread_failed)?;
     let telling = http

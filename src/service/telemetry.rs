@@ -7,9 +7,11 @@ use crate::deliver::mavlink::MavlinkDelivery;
 use crate::ingest::ServiceClock;
 use crate::mission::Mission;
 use emberfix_frames::{ServiceTime, SignedDuration};
+use emberfix_mav::outgoing::{companion_heartbeat, set_message_interval, timesync_request};
+use emberfix_mav::telemetry::CommandAck;
 use emberfix_mav::{
     Address, Chunk, ComponentId, Encoder, FrameReader, Link, MavMessage, Peer, Received, SystemId,
-    Telemetry, companion_heartbeat, message_name, set_message_interval, timesync_request,
+    Telemetry, message_name,
 };
 use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::sync::Arc;
@@ -168,7 +170,7 @@ impl Talk {
         place.and_then(|place| self.asked.remove(place)).is_some()
     }
 
-    fn take_ack(&mut self, sender: Address, ack: &emberfix_mav::CommandAck, now: ServiceTime) {
+    fn take_ack(&mut self, sender: Address, ack: &CommandAck, now: ServiceTime) {
         let Some(receipt) = self.delivery.take_ack(sender, ack, now) else {
             return;
         };
