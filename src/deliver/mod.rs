@@ -28,6 +28,7 @@ pub mod link;
 pub mod outbox;
 pub mod spatial;
 
+pub use http::{HttpError, HttpLink};
 pub use link::{AlarmLink, Courier, LinkError, Receipt, Urgency};
 pub use outbox::{Outbox, OutboxError, Put};
 
