@@ -24,10 +24,12 @@
 //! **Known limits.** MAVLink frames are not signed yet: whoever is on the link can acknowledge.
 
 pub mod link;
+pub mod mavlink;
 pub mod outbox;
 pub mod spatial;
 
 pub use link::{AlarmLink, Courier, LinkError, Receipt, Urgency};
+pub use mavlink::{MavlinkDelivery, MavlinkSettings};
 pub use outbox::{Outbox, OutboxError, Put};
 
 use crate::alarm::FireId;
