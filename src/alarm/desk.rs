@@ -58,11 +58,12 @@ impl AlarmDesk {
         Self { uav, told: BTreeMap::new() }
     }
 
-    /// The alarms that are due. `situate` places a fire on the Earth.
+    /// The alarms that are due. `situate` places a fire on the Earth; one that is nowhere on it is
+    /// not told.
     pub fn due(
         &mut self,
         fires: &[Fire],
-        mut situate: impl FnMut(&Fire) -> Situation,
+        mut situate: impl FnMut(&Fire) -> Option<Situation>,
     ) -> Vec<Alarm> {
         let mut due = Vec::new();
         for fire in fires.iter().filter(|fire| fire.is_confirmed()) {
@@ -70,13 +71,29 @@ impl AlarmDesk {
             if never_told && fire.state == FireState::Out {
                 continue;
             }
-            let situation = situate(fire);
+            let Some(situation) = situate(fire) else {
+                continue;
+            };
             let covariance = fire.covariance();
             if self.is_due(fire, &situation, &covariance) {
                 due.push(self.write(fire, situation, &covariance));
             }
         }
         due
+    }
+
+    /// The id that a fire has in alarms.
+    #[must_use]
+    pub fn id(&self, fire: FireId) -> String {
+        format!("{}-{}", self.uav, fire.0)
+    }
+
+    /// A sighting's Feature with the aircraft's name and the fire's id.
+    #[must_use]
+    pub fn signed(&self, fire: Option<FireId>, mut feature: serde_json::Value) -> serde_json::Value {
+        feature["properties"]["uav"] = self.uav.clone().into();
+        feature["properties"]["fire"] = fire.map(|fire| self.id(fire)).into();
+        feature
     }
 
     fn is_due(
@@ -114,7 +131,7 @@ impl AlarmDesk {
         Alarm {
             place,
             properties: AlarmProperties {
-                id: format!("{}-{}", self.uav, fire.id.0),
+                id: self.id(fire.id),
                 revision,
                 uav: self.uav.clone(),
                 class: fire.class,

@@ -23,6 +23,7 @@
 //!
 //! **Known limits.** MAVLink frames are not signed yet: whoever is on the link can acknowledge.
 
+pub mod http;
 pub mod link;
 pub mod mavlink;
 pub mod outbox;

@@ -1,0 +1,345 @@
+//! A folder of image pairs with timestamps.
+//!
+//! Layouts, the first that is there counts:
+//! - named by time: `left/` and `right/`, or EuRoC's `mav0/cam0/data/` and `mav0/cam1/data/`; files
+//!   `<UTC nanoseconds>.png|jpg`; eyes are matched by time, within the rig's greatest skew;
+//! - numbered: `image_l/` and `image_r/` (or `image_0/`, `image_1/`); files `000000.png`; times from
+//!   `times.txt` (a line per image: seconds, or nanoseconds as whole number of 16 digits and more),
+//!   counted from `start_utc` if that is given, or from `rate_hz` and `start_utc`.
+//!
+//! Pairs come as fast as they are asked for; each arrives at its exposure.
+
+use super::{EncodedImage, ImageEncoding, SourceCounters, SourceError, StereoPair, StereoSource};
+use bytes::Bytes;
+use emberfix_frames::{ServiceTime, SignedDuration, Stamped, seconds};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// Where a folder is, and what its files do not say.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FolderAddress {
+    /// The folder.
+    pub path: PathBuf,
+    /// Pairs per second, when there is no `times.txt`.
+    pub rate_hz: Option<f64>,
+    /// Time of the first pair (with `rate_hz`), or what `times.txt` counts from.
+    pub start_utc: Option<ServiceTime>,
+}
+
+const LAYOUTS: &str = "left/ and right/ with <UTC ns>.png|jpg, mav0/cam0/data/ and mav0/cam1/data/, \
+                       or image_l/ and image_r/ with 000000.png and times.txt or ?rate_hz=";
+const TIMED_NAME: &str = "<UTC nanoseconds>.png, .jpg or .jpeg";
+const NUMBERED_NAME: &str = "<number>.png, .jpg or .jpeg";
+const TIMES_LINE: &str = "seconds, or nanoseconds of 16 digits and more";
+
+const TIMED: [(&str, &str); 2] = [("left", "right"), ("mav0/cam0/data", "mav0/cam1/data")];
+const NUMBERED: [(&str, &str); 2] = [("image_l", "image_r"), ("image_0", "image_1")];
+
+/// Files of one pair.
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct Planned {
+    at: ServiceTime,
+    left: PathBuf,
+    right: Option<(ServiceTime, PathBuf)>,
+}
+
+/// An opened folder.
+#[derive(Debug)]
+pub struct Folder {
+    plan: std::vec::IntoIter<Planned>,
+    counters: SourceCounters,
+}
+
+impl Folder {
+    /// Lists the folder and pairs its files; reads no image yet.
+    ///
+    /// # Errors
+    /// [`SourceError`] naming the folder, file or line that does not fit, and what would.
+    pub fn open(address: &FolderAddress, max_skew_s: f64) -> Result<Self, SourceError> {
+        let find = |layouts: [(&str, &str); 2]| {
+            let folders = layouts.map(|(l, r)| (address.path.join(l), address.path.join(r)));
+            folders.into_iter().find(|(left, _)| left.is_dir())
+        };
+        let mut counters = SourceCounters {
+            openings: 1,
+            ..SourceCounters::default()
+        };
+        let plan = if let Some((left, right)) = find(TIMED) {
+            let (left, right) = (list(&left, TIMED_NAME)?, list_if_there(&right, TIMED_NAME)?);
+            pair_by_time(left, right, seconds(max_skew_s), &mut counters)
+        } else if let Some((left, right)) = find(NUMBERED) {
+            let (left, right) = (
+                list(&left, NUMBERED_NAME)?,
+                list_if_there(&right, NUMBERED_NAME)?,
+            );
+            let times = Timing::of(address)?;
+            pair_by_number(left, right, &times, address, &mut counters)?
+        } else {
+            return Err(layout(
+                address,
+                "none of the known subfolders is there".to_owned(),
+            ));
+        };
+        if plan.is_empty() {
+            return Err(layout(address, "no left images".to_owned()));
+        }
+        Ok(Self {
+            plan: plan.into_iter(),
+            counters,
+        })
+    }
+}
+
+impl StereoSource for Folder {
+    fn next_pair(&mut self) -> Result<Option<Stamped<StereoPair>>, SourceError> {
+        let Some(planned) = self.plan.next() else {
+            return Ok(None);
+        };
+        let left = read(&planned.left, planned.at)?;
+        let right = match &planned.right {
+            Some((at, path)) => Some(read(path, *at)?),
+            None => None,
+        };
+        let right_at = right.as_ref().map_or(planned.at, |right| right.at);
+        let pair = StereoPair {
+            sequence: self.counters.delivered,
+            arrived: planned.at.max(right_at),
+            skew: right_at - planned.at,
+            left,
+            right,
+        };
+        self.counters.delivered += 1;
+        Ok(Some(Stamped {
+            at: planned.at,
+            value: pair,
+        }))
+    }
+
+    fn counters(&self) -> SourceCounters {
+        self.counters
+    }
+}
+
+fn layout(address: &FolderAddress, found: String) -> SourceError {
+    SourceError::Layout {
+        path: address.path.clone(),
+        found,
+        expected: LAYOUTS,
+    }
+}
+
+fn io_error(path: &Path) -> impl Fn(std::io::Error) -> SourceError {
+    let source_name = path.display().to_string();
+    move |source| SourceError::Io {
+        source_name: source_name.clone(),
+        source,
+    }
+}
+
+fn read(path: &Path, at: ServiceTime) -> Result<EncodedImage, SourceError> {
+    let bytes = Bytes::from(std::fs::read(path).map_err(io_error(path))?);
+    let encoding = match extension(path).as_deref() {
+        Some("png") => ImageEncoding::Png,
+        _ => ImageEncoding::Jpeg,
+    };
+    Ok(EncodedImage {
+        encoding,
+        bytes,
+        at,
+    })
+}
+
+fn extension(path: &Path) -> Option<String> {
+    Some(path.extension()?.to_str()?.to_ascii_lowercase())
+}
+
+/// A folder's images by the number in their name; other files (`data.csv`) are left alone.
+fn list(folder: &Path, expected: &'static str) -> Result<BTreeMap<i64, PathBuf>, SourceError> {
+    let mut images = BTreeMap::new();
+    for entry in std::fs::read_dir(folder).map_err(io_error(folder))? {
+        let path = entry.map_err(io_error(folder))?.path();
+        if !matches!(extension(&path).as_deref(), Some("png" | "jpg" | "jpeg")) {
+            continue;
+        }
+        let number = path
+            .file_stem()
+            .and_then(|stem| stem.to_str())
+            .and_then(whole_number);
+        let number = number.ok_or_else(|| SourceError::FileName {
+            path: path.clone(),
+            expected,
+        })?;
+        if images.insert(number, path.clone()).is_some() {
+            return Err(SourceError::FileName {
+                path,
+                expected: "there once per time or number",
+            });
+        }
+    }
+    Ok(images)
+}
+
+fn list_if_there(
+    folder: &Path,
+    expected: &'static str,
+) -> Result<BTreeMap<i64, PathBuf>, SourceError> {
+    if folder.is_dir() {
+        list(folder, expected)
+    } else {
+        Ok(BTreeMap::new())
+    }
+}
+
+/// Digits only: no sign, no blank.
+fn whole_number(text: &str) -> Option<i64> {
+    text.bytes()
+        .all(|byte| byte.is_ascii_digit())
+        .then(|| text.parse().ok())?
+}
+
+fn pair_by_time(
+    left: BTreeMap<i64, PathBuf>,
+    mut right: BTreeMap<i64, PathBuf>,
+    max_skew: SignedDuration,
+    counters: &mut SourceCounters,
+) -> Vec<Planned> {
+    let mut plan = Vec::with_capacity(left.len());
+    for (ns, path) in left {
+        let at = ServiceTime::from_unix_ns(ns);
+        let reach = (at - max_skew).unix_ns()..=(at + max_skew).unix_ns();
+        let nearest = right
+            .range(reach)
+            .map(|(ns, _)| *ns)
+            .min_by_key(|r| r.abs_diff(ns));
+        let partner = nearest.and_then(|r| Some((ServiceTime::from_unix_ns(r), right.remove(&r)?)));
+        count_eyes(partner.is_some(), counters);
+        plan.push(Planned {
+            at,
+            left: path,
+            right: partner,
+        });
+    }
+    counters.stream.right_alone = right.len() as u64;
+    plan
+}
+
+fn pair_by_number(
+    left: BTreeMap<i64, PathBuf>,
+    mut right: BTreeMap<i64, PathBuf>,
+    times: &Timing,
+    address: &FolderAddress,
+    counters: &mut SourceCounters,
+) -> Result<Vec<Planned>, SourceError> {
+    if let Timing::Listed(times) = times
+        && times.len() != left.len()
+    {
+        let found = format!(
+            "times.txt has {} times for {} left images",
+            times.len(),
+            left.len()
+        );
+        return Err(layout(address, found));
+    }
+    let mut plan = Vec::with_capacity(left.len());
+    for ((number, path), index) in left.into_iter().zip(0..) {
+        let Some(at) = times.at(index) else { break };
+        let partner = right.remove(&number).map(|path| (at, path));
+        count_eyes(partner.is_some(), counters);
+        plan.push(Planned {
+            at,
+            left: path,
+            right: partner,
+        });
+    }
+    counters.stream.right_alone = right.len() as u64;
+    match plan.windows(2).find(|two| two[1].at <= two[0].at) {
+        Some(two) => Err(layout(
+            address,
+            format!("times do not rise at {}", two[1].at),
+        )),
+        None => Ok(plan),
+    }
+}
+
+fn count_eyes(both: bool, counters: &mut SourceCounters) {
+    if both {
+        counters.stream.pairs += 1;
+    } else {
+        counters.stream.left_alone += 1;
+    }
+}
+
+/// When numbered images were taken.
+enum Timing {
+    Listed(Vec<ServiceTime>),
+    Steady { start: ServiceTime, rate_hz: f64 },
+}
+
+impl Timing {
+    fn of(address: &FolderAddress) -> Result<Self, SourceError> {
+        let start = address.start_utc;
+        if let Some(rate_hz) = address.rate_hz {
+            let start = start.unwrap_or(ServiceTime::from_unix_ns(0));
+            return Ok(Self::Steady { start, rate_hz });
+        }
+        let path = address.path.join("times.txt");
+        if !path.is_file() {
+            return Err(layout(
+                address,
+                "neither times.txt nor ?rate_hz= says when".to_owned(),
+            ));
+        }
+        let text = std::fs::read_to_string(&path).map_err(io_error(&path))?;
+        let mut times = Vec::new();
+        for (line, number) in text
+            .lines()
+            .map(str::trim)
+            .zip(1..)
+            .filter(|(l, _)| !l.is_empty())
+        {
+            let ns = nanoseconds(line).ok_or_else(|| SourceError::Times {
+                path: path.clone(),
+                line: number,
+                text: line.to_owned(),
+                expected: TIMES_LINE,
+            })?;
+            let since = start.map_or(0, ServiceTime::unix_ns);
+            times.push(ServiceTime::from_unix_ns(since.saturating_add(ns)));
+        }
+        Ok(Self::Listed(times))
+    }
+
+    fn at(&self, index: u32) -> Option<ServiceTime> {
+        match self {
+            Self::Listed(times) => times.get(index as usize).copied(),
+            Self::Steady { start, rate_hz } => Some(*start + seconds(f64::from(index) / rate_hz)),
+        }
+    }
+}
+
+/// A time in nanoseconds: exactly from plain decimals, and from what numpy prints (`1.2e+01`).
+fn nanoseconds(text: &str) -> Option<i64> {
+    match whole_number(text) {
+        Some(ns) if text.len() >= 16 => Some(ns),
+        Some(seconds) => seconds.checked_mul(1_000_000_000),
+        None => decimal_seconds(text).or_else(|| float_seconds(text)),
+    }
+}
+
+fn decimal_seconds(text: &str) -> Option<i64> {
+    let (whole, fraction) = text.split_once('.')?;
+    if whole.is_empty() || !(1..=9).contains(&fraction.len()) {
+        return None;
+    }
+    let scale = 10_i64.pow(9 - u32::try_from(fraction.len()).ok()?);
+    let part = whole_number(fraction)? * scale;
+    whole_number(whole)?
+        .checked_mul(1_000_000_000)?
+        .checked_add(part)
+}
+
+fn float_seconds(text: &str) -> Option<i64> {
+    let value = text.parse::<f64>().ok().filter(|value| *value >= 0.0)?;
+    let duration = SignedDuration::try_from_secs_f64(value).ok()?;
+    i64::try_from(duration.as_nanos()).ok()
+}
