@@ -25,11 +25,13 @@
 
 pub mod http;
 pub mod link;
+pub mod mavlink;
 pub mod outbox;
 pub mod spatial;
 
 pub use http::{HttpError, HttpLink};
 pub use link::{AlarmLink, Courier, LinkError, Receipt, Urgency};
+pub use mavlink::{MavlinkDelivery, MavlinkSettings};
 pub use outbox::{Outbox, OutboxError, Put};
 
 use crate::alarm::FireId;
