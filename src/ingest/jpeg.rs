@@ -4,6 +4,7 @@
 //! Huffman-coded data of a baseline JPEG are walked here, block by block, without transforming
 //! them: every code must exist, every block must fit, and the data must end where the blocks do
 //! (ITU-T T.81, F.2). A progressive file is only checked for its markers and the number of scans.
+//! Damage that leaves a valid code is a valid file of another picture: checksums are for that.
 
 /// Why a file is no usable JPEG.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
