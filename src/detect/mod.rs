@@ -124,31 +124,14 @@ pub trait Detector: Send {
     fn detect(&mut self, image: &LeftImage) -> Result<Vec<Detection>, DetectError>;
 }
 
-/// The detector that a configuration names: a file of boxes (`.jsonl`, `.csv`) or an ONNX model.
+/// Loads the model that a mission names.
 ///
 /// # Errors
-/// [`OpenError`], a refusal that names the file and what is wrong with it.
-pub fn open(config: &DetectorConfig) -> Result<Box<dyn Detector>, OpenError> {
-    let ending = config.model.extension().and_then(|ending| ending.to_str());
-    Ok(match ending {
-        Some("jsonl" | "csv") => Box::new(BoxFileDetector::load(&config.model)?),
-        _ => {
-            let detector = OnnxDetector::load(config)?;
-            tracing::info!(info = ?detector.info(), "detector");
-            Box::new(detector)
-        }
-    })
-}
-
-/// Why there is no detector.
-#[derive(Debug, thiserror::Error)]
-pub enum OpenError {
-    /// The model was refused.
-    #[error(transparent)]
-    Model(#[from] ModelError),
-    /// The file of boxes was refused.
-    #[error(transparent)]
-    Boxes(#[from] BoxFileError),
+/// [`ModelError`] that names the file, what was expected and what was found.
+pub fn open(config: &DetectorConfig) -> Result<Box<dyn Detector>, ModelError> {
+    let detector = OnnxDetector::load(config)?;
+    tracing::info!(info = ?detector.info(), "model loaded");
+    Ok(Box::new(detector))
 }
 
 /// Why a frame has no result. The next frame may have one: count it and go on.
@@ -193,7 +176,7 @@ pub enum DetectError {
 }
 
 impl DetectError {
-    /// Short name, for counters.
+    /// A word for counters.
     #[must_use]
     pub fn name(&self) -> &'static str {
         match self {

@@ -2,7 +2,7 @@
 
 use super::camera::Slot;
 use super::{Board, SharedOutbox, lock};
-use crate::alarm::{Alarm, AlarmClass};
+use crate::alarm::Alarm;
 use crate::ground::Ping;
 use crate::ingest::ServiceClock;
 use crate::pipeline::{Event, Output, Pipeline};
@@ -107,7 +107,7 @@ impl Core {
                         recorder.write_fix_json(at, &feature);
                     }
                 }
-                Output::Alarm(alarm) => self.hand_on_alarm(*alarm),
+                Output::Alarm(alarm) => self.hand_on_alarm(&alarm),
             }
         }
     }
@@ -142,9 +142,9 @@ impl Core {
     }
 
     /// On disk first; only then do the links and the recording hear of it.
-    fn hand_on_alarm(&mut self, alarm: Alarm) {
+    fn hand_on_alarm(&self, alarm: &Alarm) {
         let now = (self.clock)();
-        if let Err(error) = lock(&self.outbox).put(&alarm, now) {
+        if let Err(error) = lock(&self.outbox).put(alarm, now) {
             tracing::error!(%error, id = alarm.properties.id, "ALARM NOT STORED");
         }
         tracing::info!(
@@ -155,23 +155,7 @@ impl Core {
             "alarm"
         );
         if let Some(recorder) = &self.recorder {
-            recorder.write_alarm(alarm.properties.captured_at, &alarm);
-        }
-        self.note_best(alarm);
-    }
-
-    /// The fire that CAMERA_TRACKING_GEO_STATUS shows: flame before smoke, then the surest.
-    fn note_best(&mut self, alarm: Alarm) {
-        let mut latest = self.board.latest();
-        let rank = |alarm: &Alarm| {
-            let flame = alarm.properties.class == AlarmClass::Fire;
-            (flame, -alarm.properties.ce90_m)
-        };
-        let better = latest.best.as_ref().is_none_or(|best| {
-            best.properties.id == alarm.properties.id || rank(&alarm) > rank(best)
-        });
-        if better {
-            latest.best = Some(alarm);
+            recorder.write_alarm(alarm.properties.captured_at, alarm);
         }
     }
 
