@@ -18,7 +18,7 @@
 //! restart the texts of what still waits are said once more.
 
 use super::link::{FIRST_RETRY, pause_after};
-use super::spatial::{self, SpatialError, receipt_of, round_sigmas_m};
+use super::spatial::{self, SpatialError, SpatialReceipt, round_sigmas_m};
 use super::{Receipt, Urgency, fire_number};
 use crate::alarm::{Alarm, AlarmClass, AlarmProperties, FireId, FireState};
 use emberfix_frames::{MslAltitude, ServiceTime, SignedDuration, Wgs84Parts};
@@ -296,10 +296,10 @@ impl MavlinkDelivery {
     }
 
     fn answered(&mut self, ack: &CommandAck, now: ServiceTime) -> Option<Receipt> {
-        let (fire, means) = receipt_of(ack.result_param2);
+        let answer = SpatialReceipt::read(ack.result_param2);
         let for_us = ack.target.reaches(self.settings.own);
-        let telling = self.fires.get_mut(&fire).filter(|telling| {
-            for_us && telling.was_tried() && means(telling.alarm.properties.revision)
+        let telling = self.fires.get_mut(&answer.fire).filter(|telling| {
+            for_us && telling.was_tried() && answer.means(telling.alarm.properties.revision)
         });
         let Some(telling) = telling else {
             self.counters.stray_answers += 1;
@@ -314,7 +314,7 @@ impl MavlinkDelivery {
         telling.text.heard();
         self.counters.delivered += 1;
         self.hurry(now);
-        self.receipt(fire)
+        self.receipt(answer.fire)
     }
 
     fn receipt(&self, fire: FireId) -> Option<Receipt> {

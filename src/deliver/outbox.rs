@@ -73,6 +73,9 @@ pub struct Outbox {
     unreadable: u64,
 }
 
+/// An id, and what stands under it.
+type Row = (String, Result<Alarm, AlarmError>);
+
 const LAYOUT: i64 = 1;
 /// How long a predecessor may take to let go of the file.
 const PATIENCE: Duration = Duration::from_millis(500);
@@ -227,11 +230,7 @@ impl Outbox {
             .map(|c| c.into_iter().max().unwrap_or(0))
     }
 
-    fn read_pending(
-        &self,
-        link: &str,
-        limit: usize,
-    ) -> Result<Vec<(String, Result<Alarm, AlarmError>)>, OutboxError> {
+    fn read_pending(&self, link: &str, limit: usize) -> Result<Vec<Row>, OutboxError> {
         let select = format!(
             "SELECT alarms.id, alarms.json {WAITING_FOR} ORDER BY urgency, stored LIMIT ?2"
         );

@@ -184,14 +184,32 @@ pub fn receipt(fire: FireId, revision: u32) -> i32 {
     ((revision & 0x7F) << 24 | fire.0 & GREATEST_NUMBER) as i32
 }
 
-/// The fire that a `result_param2` names, and whether it can mean this revision of it.
-#[must_use]
-pub fn receipt_of(result_param2: i32) -> (FireId, impl Fn(u32) -> bool) {
-    let bits = result_param2 as u32;
-    let told = bits >> 24 & 0x7F;
-    (FireId(bits & GREATEST_NUMBER), move |revision| {
-        told == 0 || told == revision.min(GREATEST_REVISION) & 0x7F
-    })
+/// What a `result_param2` says.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SpatialReceipt {
+    /// Which fire.
+    pub fire: FireId,
+    /// Revision modulo 128; 0 where the ground does not say it.
+    revision_mod_128: u32,
+}
+
+impl SpatialReceipt {
+    /// From an answer's `result_param2`.
+    #[must_use]
+    pub fn read(result_param2: i32) -> Self {
+        let bits = result_param2 as u32;
+        Self {
+            fire: FireId(bits & GREATEST_NUMBER),
+            revision_mod_128: bits >> 24 & 0x7F,
+        }
+    }
+
+    /// Whether it can mean this revision of the fire.
+    #[must_use]
+    pub fn means(self, revision: u32) -> bool {
+        let sent = revision.min(GREATEST_REVISION) & 0x7F;
+        self.revision_mod_128 == 0 || self.revision_mod_128 == sent
+    }
 }
 
 impl SpatialAlarm {
@@ -401,10 +419,10 @@ mod tests {
         #[test]
         fn a_receipt_names_its_revision(number in 1_u32..=GREATEST_NUMBER, revision in 1_u32..20_000) {
             let told = revision.min(GREATEST_REVISION);
-            let (fire, means) = receipt_of(receipt(FireId(number), told));
-            prop_assert_eq!(fire, FireId(number));
-            prop_assert!(means(revision));
-            prop_assert!(told % 128 == 0 || !means(told.wrapping_sub(1)));
+            let read = SpatialReceipt::read(receipt(FireId(number), told));
+            prop_assert_eq!(read.fire, FireId(number));
+            prop_assert!(read.means(revision));
+            prop_assert!(told % 128 == 0 || !read.means(told - 1));
         }
     }
 
