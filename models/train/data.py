@@ -253,7 +253,7 @@ class Mixer:
         elif kind < (0.60 if self.extra else 0.55):
             self.mosaic(rng, c)
         else:
-            self.single(rng, c, self.real(rng), 0.5, 1.45)
+            self.single(rng, c, self.real(rng), 0.6, 1.4)
         img = photometric(rng, c.image)
         boxes = np.array(c.boxes, np.float32).reshape(-1, 5)
         valid = c.valid

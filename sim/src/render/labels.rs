@@ -1,0 +1,120 @@
+//! Where fire and smoke are seen in the left image: boxes for training and for scoring.
+
+use super::camera::{EyePose, Lens};
+use super::solids::Solids;
+use super::splats::{SeenSplat, billows, ray_to};
+use super::PixelBox;
+use crate::world::{Burning, BurningClass, Splat, SplatKind, World};
+
+/// A fire or smoke that the left eye sees.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LabelBox {
+    /// Flame or smoke.
+    pub class: BurningClass,
+    /// Index into [`World::fires`] of what burns; a flame and its plume share it.
+    pub fire: usize,
+    /// Left edge, raw left pixels; pixel centres at whole numbers.
+    pub left_px: f64,
+    /// Upper edge.
+    pub top_px: f64,
+    /// Right edge.
+    pub right_px: f64,
+    /// Lower edge.
+    pub bottom_px: f64,
+}
+
+/// Alpha from which an annotator would call a pixel flame or smoke.
+fn visible_alpha(class: BurningClass) -> f32 {
+    match class {
+        BurningClass::Fire => 0.30,
+        BurningClass::Smoke => 0.14,
+    }
+}
+
+/// Smaller than this nobody could label it, pixels.
+const SMALLEST_PX: f64 = 3.0;
+/// Hidden to a greater share than this it is not labelled.
+const MOST_HIDDEN: f64 = 0.8;
+/// Boxes longer than this are searched on a coarser raster, pixels.
+const RASTER_PX: usize = 256;
+
+pub(super) fn label(
+    burning: &Burning,
+    world: &World,
+    pose: &EyePose,
+    lens: &Lens,
+    solids: &Solids,
+) -> Option<LabelBox> {
+    let kept = |splat: &&Splat| splat.kind != SplatKind::Light;
+    let all: Vec<(&Splat, SeenSplat)> = burning
+        .splats
+        .iter()
+        .filter(kept)
+        .filter_map(|splat| SeenSplat::new(splat, pose, lens).map(|seen| (splat, seen)))
+        .collect();
+    let visible: Vec<SeenSplat> = all
+        .iter()
+        .filter(|(splat, seen)| is_free(splat, seen, world, pose, solids))
+        .map(|(_, seen)| *seen)
+        .collect();
+    if visible.is_empty() || (visible.len() as f64) < (1.0 - MOST_HIDDEN) * all.len() as f64 {
+        return None;
+    }
+    let extent = opaque_extent(&visible, world, visible_alpha(burning.class))?;
+    let (width, height) = (extent.2 - extent.0, extent.3 - extent.1);
+    (width >= SMALLEST_PX && height >= SMALLEST_PX).then_some(LabelBox {
+        class: burning.class,
+        fire: burning.fire,
+        left_px: extent.0,
+        top_px: extent.1,
+        right_px: extent.2,
+        bottom_px: extent.3,
+    })
+}
+
+fn is_free(splat: &Splat, seen: &SeenSplat, world: &World, pose: &EyePose, solids: &Solids) -> bool {
+    let ray = ray_to(splat, pose);
+    let behind_hill = world.terrain().hit(&pose.origin_m, &ray, 0.98).is_some();
+    !behind_hill && !solids.hide(seen.tangents, 0.99 * seen.depth_m)
+}
+
+/// Edges of the pixels where the splats together hold back at least `alpha`.
+fn opaque_extent(splats: &[SeenSplat], world: &World, alpha: f32) -> Option<(f64, f64, f64, f64)> {
+    let (first, rest) = splats.split_first()?;
+    let area = rest.iter().fold(first.extent, |area, splat| area.with(&splat.extent));
+    let step = (area.columns().max(area.rows()) / RASTER_PX).max(1);
+    let (columns, rows) = (area.columns().div_ceil(step), area.rows().div_ceil(step));
+    let mut clear = vec![1.0_f32; columns * rows];
+    let billows = billows(world.textures());
+    for splat in splats {
+        darken(&mut clear, columns, &area, step, splat, &billows);
+    }
+    let (mut low, mut high) = ((usize::MAX, usize::MAX), (0, 0));
+    for (k, _) in clear.iter().enumerate().filter(|(_, clear)| **clear < 1.0 - alpha) {
+        let (x, y) = (k % columns, k / columns);
+        low = (low.0.min(x), low.1.min(y));
+        high = (high.0.max(x + 1), high.1.max(y + 1));
+    }
+    let edge = |start: usize, cells: usize| (start + cells * step) as f64 - 0.5;
+    (low.0 < high.0).then(|| {
+        (edge(area.left, low.0), edge(area.top, low.1), edge(area.left, high.0), edge(area.top, high.1))
+    })
+}
+
+/// Takes away the light that one splat holds back.
+fn darken(
+    clear: &mut [f32],
+    columns: usize,
+    area: &PixelBox,
+    step: usize,
+    splat: &SeenSplat,
+    billows: &crate::world::Lod,
+) {
+    let range = |low: usize, high: usize, start: usize| (low - start).div_ceil(step)..=(high - 1 - start) / step;
+    for row in range(splat.extent.top, splat.extent.bottom, area.top) {
+        for column in range(splat.extent.left, splat.extent.right, area.left) {
+            let cover = splat.cover(area.left + column * step, area.top + row * step, billows);
+            clear[row * columns + column] *= 1.0 - splat.alpha(cover);
+        }
+    }
+}
