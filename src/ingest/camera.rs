@@ -289,14 +289,14 @@ impl Grabber {
             });
         }
         let mut frames = Vec::with_capacity(2);
-        for index in 0..self.captures.len() {
+        for (index, grabbed) in arrivals.iter().enumerate() {
             let mut frame = Mat::default();
             let got = self.captures[index].retrieve_def(&mut frame);
             if !got.map_err(|source| self.failed(source))? || frame.empty() {
                 return Ok(None);
             }
             self.check_size((frame.cols(), frame.rows()))?;
-            let at = self.capture_time(index, arrivals[index]);
+            let at = self.capture_time(index, *grabbed);
             frames.push((frame, at));
         }
         let arrived = arrivals.last().map(|moment| moment.service);
@@ -344,7 +344,7 @@ impl Grabber {
         let (at, capture_clock) = match &self.address.device {
             CaptureDevice::File { start, .. } => (*start + position, CaptureClock::Stated),
             CaptureDevice::Gstreamer(_) if position.is_positive() => (
-                self.from_least_delay(arrived, position),
+                self.tied_by_least_delay(arrived, position),
                 CaptureClock::StreamPosition,
             ),
             CaptureDevice::Gstreamer(_) => (arrived, CaptureClock::Arrival),
@@ -357,7 +357,11 @@ impl Grabber {
     }
 
     /// Ties a stream position to our clock: the frame with the least delay had nearly none.
-    fn from_least_delay(&mut self, arrived: ServiceTime, position: SignedDuration) -> ServiceTime {
+    fn tied_by_least_delay(
+        &mut self,
+        arrived: ServiceTime,
+        position: SignedDuration,
+    ) -> ServiceTime {
         let origin = ServiceTime::from_unix_ns(0);
         let delay = (arrived - position) - origin;
         let least = self.least_delay.map_or(delay, |least| least.min(delay));

@@ -474,4 +474,26 @@ mod tests {
         std::fs::write(timeless.path().join("times.txt"), "1\n2\n").unwrap();
         assert!(refuse(timeless.path()).contains("2 times for 1 left images"));
     }
+
+    #[test]
+    fn the_drive_of_kitti_opens_as_it_lies() {
+        let shared = std::env::var_os("EMBERFIX_SHARED").map_or("../shared".into(), PathBuf::from);
+        let path = Path::new(env!("CARGO_MANIFEST_DIR"))
+            .join(shared)
+            .join("data/vehicle/kitti_01");
+        if !path.is_dir() {
+            println!("skipped: no shared data");
+            return;
+        }
+        let address = FolderAddress {
+            path,
+            rate_hz: Some(10.0),
+            start_utc: None,
+        };
+        let mut folder = Folder::open(&address, 0.001).unwrap();
+        let times = times_and_eyes(&mut folder);
+        assert_eq!(times.len(), 51);
+        assert!(times.iter().all(|(_, both)| *both));
+        assert_eq!(times[50].0, 5_000_000_000);
+    }
 }

@@ -373,6 +373,38 @@ fn a_full_disk_stops_the_recording_loudly_and_nothing_else() {
     assert!(error.contains("No space left"), "{error}");
 }
 
+#[test]
+fn a_slow_disk_costs_images_and_never_telemetry() {
+    let (mut disk, file) = std::io::pipe().unwrap();
+    let file = std::fs::File::from(std::os::fd::OwnedFd::from(file));
+    let path = Path::new("pipe");
+    let tape = Tape::on(file, path, &rig(), &RecordOptions::default()).unwrap();
+    let recorder = Recorder::start(tape, path).unwrap();
+    // Nobody reads: the pipe is full after a few chunks, and the thread waits.
+    let pairs = 200;
+    for n in 0..pairs {
+        recorder.write_mavlink(at(100 * n - 5), &HEARTBEAT);
+        recorder.write_pair(&recorded_pair(n % PAIRS));
+    }
+    let shed = recorder.status().shed_pairs;
+    assert!(shed > 0, "no disk is that fast");
+    let reading = std::thread::spawn(move || {
+        let mut bytes = Vec::new();
+        std::io::Read::read_to_end(&mut disk, &mut bytes).map(|_| bytes)
+    });
+    // A pipe can't be synced, which is all that can fail here.
+    assert!(
+        recorder
+            .finish()
+            .unwrap_err()
+            .to_string()
+            .contains("Invalid argument")
+    );
+    let (events, counters) = stream(&reading.join().unwrap().unwrap(), 4096);
+    assert_eq!(counters.mavlink, pairs as u64);
+    assert!(events.len() < 2 * pairs as usize);
+}
+
 /// The Python environment of the test clients, when it is set up.
 fn python() -> Option<PathBuf> {
     let here = workspace().join(".x/venv/bin/python");
