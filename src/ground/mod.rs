@@ -172,8 +172,11 @@ impl Ground {
         let names = Arc::from(config.host_names.as_slice());
         let app = http::router(Arc::clone(&station), names);
         let mut stopping = station.stopping.subscribe();
-        let server = axum::serve(listener::Bounded::new(socket), app)
-            .with_graceful_shutdown(async move { drop(stopping.wait_for(|stop| *stop).await) });
+        let server = axum::serve(
+            listener::Bounded::new(socket, listener::Limits::default()),
+            app,
+        )
+        .with_graceful_shutdown(async move { drop(stopping.wait_for(|stop| *stop).await) });
         let server = tokio::spawn(async move { server.await });
         Ok(Self {
             address,
