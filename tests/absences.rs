@@ -1,5 +1,7 @@
 //! What is not there: the imports that `src/lib.rs` and `ARCHITECTURE.md` promise away.
 
+#![expect(clippy::unwrap_used, reason = "a test may stop at its first surprise")]
+
 use std::path::{Path, PathBuf};
 
 fn root() -> &'static Path {
