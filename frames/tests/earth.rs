@@ -1,5 +1,7 @@
 //! Properties over the whole Earth, against GeographicLib's geodesics and our own way back.
 
+#![expect(clippy::unwrap_used, reason = "a test may stop at its first surprise")]
+
 use emberfix_frames::{
     Coordinate, Ecef, EllipsoidHeight, Metres, MissionEnu, Vector3, Wgs84, Wgs84Parts,
     ecef_from_enu, enu_offset, place_from_degrees,

@@ -1,5 +1,7 @@
 //! Conversions against published vectors (`tests/data/geo`, sources in the rows themselves).
 
+#![expect(clippy::unwrap_used, clippy::panic, reason = "a test may stop at its first surprise")]
+
 use emberfix_frames::{
     Coordinate, Ecef, EllipsoidHeight, Geoid, Metres, MissionEnu, Vector, Vector3, Wgs84,
     Wgs84Parts, ecef_from_enu, enu_from_ecef, place_from_degrees, place_from_ecef,

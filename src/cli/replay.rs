@@ -55,7 +55,7 @@ fn images_and_telemetry(
         Some(path) => Box::new(detect::BoxFileDetector::load(path).map_err(Failure::refused)?),
         None => detect::open(&mission.detector).map_err(Failure::refused)?,
     };
-    let ranger = SgbmRanger::new(&mission.rig, mission.range).map_err(Failure::refused)?;
+    let ranger = SgbmRanger::new(&mission.rig, mission.range.clone()).map_err(Failure::refused)?;
     let pipeline = Pipeline::new(mission, detector, Box::new(ranger), FireId(1));
     let replay = Replay::open(&arguments.recording, mission, pipeline);
     let bar = ProgressBar::new_spinner();

@@ -45,7 +45,7 @@ pub fn run(arguments: RunArguments) -> Result<(), Failure> {
         mission.state_dir = folder;
     }
     let detector = crate::detect::open(&mission.detector).map_err(Failure::refused)?;
-    let ranger = SgbmRanger::new(&mission.rig, mission.range).map_err(Failure::refused)?;
+    let ranger = SgbmRanger::new(&mission.rig, mission.range.clone()).map_err(Failure::refused)?;
     let fail = |error: ServiceError| {
         if error.is_refusal() { Failure::refused(error) } else { Failure::failed(error) }
     };

@@ -29,11 +29,13 @@ mod messages;
 mod pairing;
 pub mod recording;
 pub mod socket;
+#[cfg(test)]
+pub(crate) mod testing;
 mod url;
 
 pub use blocks::RECORD_LIMIT_BYTES;
 pub use camera::CaptureClock;
-pub use decode::{DecodeError, EyeHealth, EyeWatch};
+pub use decode::{DecodeError, EyeHealth, EyeWatch, ImageDecoder};
 pub use live::LatestPair;
 pub use mcap_stream::{McapStream, StreamEvent};
 pub use messages::{CalibrationMismatch, StatedCalibration};
@@ -186,7 +188,8 @@ pub enum SourceError {
     },
     /// A recording without anything that we could replay.
     #[error(
-        "recording {path}: holds no message of {expected}",
+        "recording {path}: holds no whole message of {expected} ({bad_chunks} damaged chunks, \
+         {lost_bytes} bytes cut off)",
         path = path.display()
     )]
     NothingRecorded {
@@ -194,6 +197,10 @@ pub enum SourceError {
         path: PathBuf,
         /// The topics that were looked for.
         expected: &'static str,
+        /// Chunks that are damaged.
+        bad_chunks: u64,
+        /// Bytes of records that are not whole.
+        lost_bytes: u64,
     },
     /// A live source that gave nothing for a while; it may come back.
     #[error("camera source {source_name}: no frames for {waited_s} s")]

@@ -29,7 +29,8 @@ use emberfix_frames::{
     ServiceTime, SignedDuration, Stamped, TimeSyncSample, Wgs84, Wgs84Parts, ecef_from_enu, place_from_ecef,
     seconds,
 };
-use emberfix_mav::{Address, GpsRaw, Received, SystemId, Telemetry, TimeSyncMessage};
+use emberfix_mav::telemetry::{GpsRaw, TimeSyncMessage};
+use emberfix_mav::{Address, Received, SystemId, Telemetry};
 use std::sync::Arc;
 
 /// One thing that reached the service.

@@ -21,6 +21,8 @@ mod convert;
 mod recorder;
 mod schemas;
 mod tape;
+#[cfg(test)]
+mod tests;
 
 pub use recorder::{ENTRY_QUEUE, IMAGE_QUEUE, Recorder, RecorderState, RecorderStatus};
 pub use tape::Tape;

@@ -118,7 +118,11 @@ impl Recorder {
     /// # Errors
     /// [`RecordError::Io`] when the file is there already or can't be created.
     pub fn create(path: &Path, rig: &Rig, options: &RecordOptions) -> Result<Self, RecordError> {
-        let tape = Tape::create(path, rig, options)?;
+        Self::start(Tape::create(path, rig, options)?, path)
+    }
+
+    /// Starts the thread that writes on a tape.
+    pub(super) fn start(tape: Tape, path: &Path) -> Result<Self, RecordError> {
         let (sender, receiver) = sync_channel(ENTRY_QUEUE);
         let shared = Arc::<Shared>::default();
         let theirs = Arc::clone(&shared);
@@ -276,7 +280,7 @@ fn write_all(
         if shared.stop_reason().is_some() {
             shared.lost.fetch_add(1, Ordering::Relaxed);
         } else if let Err(error) = write_entry(&mut tape, entry) {
-            shared.stop(error.to_string());
+            shared.stop(with_causes(&error));
         } else {
             shared.written.fetch_add(1, Ordering::Relaxed);
         }
@@ -289,6 +293,17 @@ fn write_all(
     }
     tape.finish()
         .inspect_err(|error| shared.stop(error.to_string()))
+}
+
+/// An error and what caused it: `No space left on device` stands at the bottom.
+fn with_causes(error: &RecordError) -> String {
+    let mut text = error.to_string();
+    let mut cause = std::error::Error::source(error).and_then(std::error::Error::source);
+    while let Some(error) = cause {
+        text = format!("{text}: {error}");
+        cause = error.source();
+    }
+    text
 }
 
 fn write_entry(tape: &mut Tape, entry: Entry) -> Result<(), RecordError> {

@@ -77,7 +77,20 @@ impl Tape {
             path: path.to_owned(),
             source,
         };
-        let file = File::create_new(path).map_err(io)?;
+        Self::on(File::create_new(path).map_err(io)?, path, rig, options)
+    }
+
+    /// Writes to an opened, empty file.
+    pub(super) fn on(
+        file: File,
+        path: &Path,
+        rig: &Rig,
+        options: &RecordOptions,
+    ) -> Result<Self, RecordError> {
+        let io = |source| RecordError::Io {
+            path: path.to_owned(),
+            source,
+        };
         let syncing = file.try_clone().map_err(io)?;
         let compression = match options.compression {
             ChunkCompression::Lz4 => Some(Compression::Lz4),

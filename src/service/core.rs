@@ -2,13 +2,15 @@
 
 use super::camera::Slot;
 use super::{Board, SharedOutbox, lock};
-use crate::alarm::{Alarm, AlarmClass};
+use crate::alarm::Alarm;
 use crate::ground::Ping;
 use crate::ingest::ServiceClock;
 use crate::pipeline::{Event, Output, Pipeline};
 use crate::pose::Pose;
 use crate::record::{BodyPose, Recorder, UavFix};
-use emberfix_frames::{Covariance, ServiceTime, VehicleEnu, Wgs84Parts};
+use emberfix_frames::{
+    Covariance, ServiceTime, UnitQuaternion, Wgs84, Wgs84Parts, enu_offset,
+};
 use emberfix_mav::Received;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
@@ -36,6 +38,7 @@ pub struct Core {
     pub board: Arc<Board>,
     pub clock: ServiceClock,
     pub uav: String,
+    pub datum: Wgs84,
 }
 
 /// How long the thread sleeps when nothing comes.
@@ -104,7 +107,7 @@ impl Core {
                         recorder.write_fix_json(at, &feature);
                     }
                 }
-                Output::Alarm(alarm) => self.hand_on_alarm(*alarm),
+                Output::Alarm(alarm) => self.hand_on_alarm(&alarm),
             }
         }
     }
@@ -119,23 +122,29 @@ impl Core {
             longitude_deg: pose.place.longitude_deg(),
             height_ellipsoid_m: pose.place.height().m(),
             heading_deg: Some(heading_deg),
-            health: if health.is_empty() { None } else { Some(health.join("; ")) },
+            health: if health.is_empty() { "ok".to_owned() } else { health.join("; ") },
         });
         if let Some(recorder) = &self.recorder {
             let (h, v) = (pose.gnss_horizontal_m, pose.gnss_vertical_m);
-            let covariance = Covariance::<VehicleEnu>::from_sigmas_m(h, h, v);
-            recorder.write_uav_fix(pose.at, &UavFix { place: pose.place, covariance });
+            let covariance = Covariance::from_sigmas_m(h, h, v);
+            let heading_rad = Some(pose.attitude.angles().2);
+            recorder.write_uav_fix(pose.at, &UavFix { place: pose.place, covariance, heading_rad });
+            let (w, i, j, k) = pose.attitude.enu_from_body().to_quaternion();
+            let quaternion = nalgebra::Quaternion::new(w, i, j, k);
             recorder.write_body_pose(
                 pose.at,
-                &BodyPose { place: pose.place, attitude: pose.attitude },
+                &BodyPose {
+                    position_enu_m: enu_offset(&self.datum, &pose.place),
+                    enu_from_body: UnitQuaternion::new_normalize(quaternion),
+                },
             );
         }
     }
 
     /// On disk first; only then do the links and the recording hear of it.
-    fn hand_on_alarm(&mut self, alarm: Alarm) {
+    fn hand_on_alarm(&self, alarm: &Alarm) {
         let now = (self.clock)();
-        if let Err(error) = lock(&self.outbox).put(&alarm, now) {
+        if let Err(error) = lock(&self.outbox).put(alarm, now) {
             tracing::error!(%error, id = alarm.properties.id, "ALARM NOT STORED");
         }
         tracing::info!(
@@ -146,23 +155,7 @@ impl Core {
             "alarm"
         );
         if let Some(recorder) = &self.recorder {
-            recorder.write_alarm(alarm.properties.captured_at, &alarm);
-        }
-        self.note_best(alarm);
-    }
-
-    /// The fire that CAMERA_TRACKING_GEO_STATUS shows: flame before smoke, then the surest.
-    fn note_best(&mut self, alarm: Alarm) {
-        let mut latest = self.board.latest();
-        let rank = |alarm: &Alarm| {
-            let flame = alarm.properties.class == AlarmClass::Fire;
-            (flame, -alarm.properties.ce90_m)
-        };
-        let better = latest.best.as_ref().is_none_or(|best| {
-            best.properties.id == alarm.properties.id || rank(&alarm) > rank(best)
-        });
-        if better {
-            latest.best = Some(alarm);
+            recorder.write_alarm(alarm.properties.captured_at, alarm);
         }
     }
 

@@ -18,7 +18,7 @@ mod core;
 mod courier;
 mod telemetry;
 
-use crate::alarm::Alarm;
+use crate::deliver::mavlink::MavlinkDelivery;
 use crate::deliver::{Outbox, OutboxError};
 use crate::ground::Ping;
 use crate::ingest::{CameraUrl, CameraUrlError, ServiceClock, SourceError};
@@ -36,8 +36,7 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 /// Messages that may wait for the pipeline: about a minute of a PX4 onboard link.
 pub const TELEMETRY_QUEUE: usize = 16_384;
 /// The links of the outbox.
-pub const LINKS: [&str; 2] = [MAVLINK, HTTP];
-pub(crate) const MAVLINK: &str = "mavlink";
+pub const LINKS: [&str; 2] = [MavlinkDelivery::NAME, HTTP];
 pub(crate) const HTTP: &str = "http";
 
 /// Why the service did not start, or stopped.
@@ -101,7 +100,6 @@ pub(crate) struct Latest {
     pub reported: Option<Instant>,
     pub vehicle: Option<SystemId>,
     pub ping: Option<Ping>,
-    pub best: Option<Alarm>,
 }
 
 /// A pipeline that has not reported for this long hangs.
@@ -191,6 +189,7 @@ pub async fn run(
         board: Arc::clone(&board),
         clock: Arc::clone(&clock),
         uav: mission.uav.clone(),
+        datum: mission.datum,
     };
     let working = core::start(worker, inbox, slot).map_err(thread_failed)?;
     let telling = http

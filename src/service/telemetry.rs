@@ -2,14 +2,15 @@
 //! they come, keeps time, hands frames to the pipeline, sends alarms.
 
 use super::core::Input;
-use super::{Board, MAVLINK, SharedOutbox, lock};
-use crate::deliver::mavlink::MavlinkDelivery;
+use super::{Board, SharedOutbox, lock};
+use crate::deliver::mavlink::{MavlinkDelivery, MavlinkSettings};
 use crate::ingest::ServiceClock;
 use crate::mission::Mission;
 use emberfix_frames::{ServiceTime, SignedDuration};
+use emberfix_mav::outgoing::{companion_heartbeat, set_message_interval, timesync_request};
 use emberfix_mav::{
     Address, Chunk, ComponentId, Encoder, FrameReader, Link, MavMessage, Peer, Received, SystemId,
-    Telemetry, companion_heartbeat, message_name, set_message_interval, timesync_request,
+    Telemetry, message_name,
 };
 use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::sync::Arc;
@@ -30,6 +31,8 @@ const TOO_SLOW: f64 = 0.5;
 const RATE_CHECK: SignedDuration = SignedDuration::from_secs(5);
 const HEARTBEAT: SignedDuration = SignedDuration::from_secs(1);
 const TIMESYNC: SignedDuration = SignedDuration::from_millis(100);
+/// How often the outbox is looked at.
+const OUTBOX_LOOK: SignedDuration = SignedDuration::from_millis(100);
 /// How often due work is looked for.
 const LOOK: Duration = Duration::from_millis(20);
 /// TIMESYNC requests that may still be answered.
@@ -43,7 +46,8 @@ pub struct Talk {
     readers: HashMap<Peer, FrameReader>,
     encoder: Option<Encoder>,
     configured: Option<SystemId>,
-    delivery: MavlinkDelivery,
+    agent: Address,
+    delivery: Option<MavlinkDelivery>,
     outbox: SharedOutbox,
     board: Arc<Board>,
     clock: ServiceClock,
@@ -53,6 +57,7 @@ pub struct Talk {
     heartbeat_due: ServiceTime,
     timesync_due: ServiceTime,
     rates_due: ServiceTime,
+    outbox_due: ServiceTime,
 }
 
 impl Talk {
@@ -70,7 +75,8 @@ impl Talk {
             readers: HashMap::new(),
             encoder: None,
             configured: (mission.system_id != 0).then_some(SystemId(mission.system_id)),
-            delivery: MavlinkDelivery::new(Address::new(system, component)),
+            agent: Address::new(system, component),
+            delivery: None,
             outbox,
             board,
             clock,
@@ -80,6 +86,7 @@ impl Talk {
             heartbeat_due: now,
             timesync_due: now,
             rates_due: now,
+            outbox_due: now,
         }
     }
 
@@ -125,8 +132,8 @@ impl Talk {
             Ok(Telemetry::TimeSync(sync)) if !sync.is_request() && !self.was_asked(sync.ts1_ns) => {
                 return;
             }
-            Ok(Telemetry::CommandAck(ack)) => self.take_ack(sender, ack, arrived),
-            _ => {}
+            Ok(telemetry) => self.observe(sender, telemetry, arrived),
+            Err(_) => {}
         }
         if Some(sender.system) == self.vehicle() {
             *self.counted.entry(received.frame.message_id).or_default() += 1;
@@ -148,9 +155,11 @@ impl Talk {
         let system = received.system();
         let ours = self.configured.is_none_or(|configured| configured == system);
         if self.encoder.is_none() && autopilot && ours {
-            self.encoder = Some(Encoder::new(Address {
-                system,
-                component: ComponentId::ONBOARD_COMPUTER,
+            let own = Address { system, component: ComponentId::ONBOARD_COMPUTER };
+            self.encoder = Some(Encoder::new(own));
+            self.delivery = Some(MavlinkDelivery::new(MavlinkSettings {
+                ground: self.agent,
+                ..MavlinkSettings::new(own)
             }));
             tracing::info!(system = system.0, "vehicle heard");
         }
@@ -168,11 +177,13 @@ impl Talk {
         place.and_then(|place| self.asked.remove(place)).is_some()
     }
 
-    fn take_ack(&mut self, sender: Address, ack: &emberfix_mav::CommandAck, now: ServiceTime) {
-        let Some(receipt) = self.delivery.take_ack(sender, ack, now) else {
+    fn observe(&mut self, sender: Address, telemetry: &Telemetry, now: ServiceTime) {
+        let delivery = self.delivery.as_mut();
+        let Some(receipt) = delivery.and_then(|d| d.observe(sender, telemetry, now)) else {
             return;
         };
-        let stored = lock(&self.outbox).acknowledge(MAVLINK, &receipt.id, receipt.revision);
+        let stored =
+            lock(&self.outbox).acknowledge(MavlinkDelivery::NAME, &receipt.id, receipt.revision);
         if let Err(error) = stored {
             tracing::error!(%error, "receipt not stored; it will be sent again");
         }
@@ -219,16 +230,25 @@ impl Talk {
     }
 
     async fn tell_alarms(&mut self, now: ServiceTime) {
-        let pending = match lock(&self.outbox).pending(MAVLINK, MavlinkDelivery::BATCH) {
-            Ok(pending) => pending,
-            Err(error) => {
-                tracing::error!(%error, "outbox not readable");
-                return;
-            }
-        };
-        let best = self.board.latest().best.clone();
-        for message in self.delivery.due(&pending, best.as_ref(), now) {
+        if now >= self.outbox_due {
+            self.outbox_due = now + OUTBOX_LOOK;
+            self.offer_pending();
+        }
+        while let Some(message) = self.delivery.as_mut().and_then(|delivery| delivery.poll(now)) {
             self.send(&message).await;
+        }
+    }
+
+    fn offer_pending(&mut self) {
+        let pending = lock(&self.outbox).pending(MavlinkDelivery::NAME, MavlinkDelivery::MAX_FIRES);
+        let (Ok(pending), Some(delivery)) = (pending, &mut self.delivery) else {
+            tracing::error!("outbox not readable");
+            return;
+        };
+        for alarm in &pending {
+            if let Err(error) = delivery.offer(alarm) {
+                tracing::warn!(%error, id = alarm.properties.id, "alarm not told over MAVLink");
+            }
         }
     }
 
