@@ -22,6 +22,8 @@ pub mod pipeline;
 pub mod pose;
 pub mod range;
 pub mod record;
+pub mod replay;
+pub mod service;
 pub mod track;
 
 #[cfg(test)]

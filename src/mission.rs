@@ -144,6 +144,8 @@ struct RawModel {
     sha256: Option<String>,
     family: Option<Family>,
     threshold: Option<f64>,
+    #[serde(default)]
+    whole_frame_only: bool,
     tile_px: Option<u32>,
     overlap_px: Option<u32>,
     threads: Option<u32>,
@@ -241,6 +243,7 @@ const KNOWN: &[&str] = &[
     "model.sha256",
     "model.family",
     "model.threshold",
+    "model.whole_frame_only",
     "model.tile_px",
     "model.overlap_px",
     "model.threads",
@@ -312,7 +315,7 @@ fn check(raw: &RawMission) -> Vec<String> {
     checks.range("datum.latitude_deg", raw.datum.latitude_deg, -90.0, 90.0, "");
     checks.range("datum.longitude_deg", raw.datum.longitude_deg, -180.0, 180.0, "");
     checks.range("datum.height_ellipsoid_m", raw.datum.height_ellipsoid_m, -500.0, 9000.0, "");
-    check_model(&mut checks, raw);
+    check_numbers(&mut checks, raw);
     if let Some(terrain) = &raw.terrain {
         if terrain.kind != "plane" {
             checks.problem(format!("terrain.kind is {:?}, allowed is \"plane\"", terrain.kind));
@@ -327,22 +330,13 @@ fn check(raw: &RawMission) -> Vec<String> {
     checks.into_problems()
 }
 
-fn check_model(checks: &mut Checks, raw: &RawMission) {
-    if let Some(threshold) = raw.model.threshold {
-        checks.range("model.threshold", threshold, 0.01, 0.99, "");
-    }
-    if let Some(tile_px) = raw.model.tile_px {
-        checks.range("model.tile_px", f64::from(tile_px), 64.0, 4096.0, "");
-    }
-    if let Some(threads) = raw.model.threads {
-        checks.range("model.threads", f64::from(threads), 1.0, 64.0, "");
-    }
-    if let Some(most) = raw.range.max_disparity_px {
-        checks.range("range.max_disparity_px", f64::from(most), 16.0, 1024.0, "");
-    }
-    if let Some(limit) = raw.range.max_sigma_over_range {
-        checks.range("range.max_sigma_over_range", limit, 0.01, 1.0, "");
-    }
+/// What the rooms check themselves, with the mission's key in front.
+fn check_numbers(checks: &mut Checks, raw: &RawMission) {
+    let model = detector(&raw.model, &Path::to_owned).problems();
+    let range = range(&raw.range).problems();
+    let named = |table: &'static str| move |problem: String| format!("{table}.{problem}");
+    model.into_iter().map(named("model")).for_each(|problem| checks.problem(problem));
+    range.into_iter().map(named("range")).for_each(|problem| checks.problem(problem));
 }
 
 fn check_sigma(checks: &mut Checks, sigma: &RawSigma) {
@@ -410,4 +404,26 @@ fn build(raw: RawMission, path: &Path) -> Result<Mission, MissionError> {
         terrain,
         state_dir,
     })
+}
+
+fn detector(raw: &RawModel, beside: &dyn Fn(&Path) -> PathBuf) -> DetectorConfig {
+    let usual = DetectorConfig::new(beside(&raw.path));
+    DetectorConfig {
+        sha256: raw.sha256.clone(),
+        family: raw.family,
+        threshold: raw.threshold,
+        tile_px: if raw.whole_frame_only { None } else { raw.tile_px.or(usual.tile_px) },
+        overlap_px: raw.overlap_px.unwrap_or(usual.overlap_px),
+        threads: raw.threads.map_or(usual.threads, |threads| threads as usize),
+        ..usual
+    }
+}
+
+fn range(raw: &RawRange) -> SgbmConfig {
+    let usual = SgbmConfig::default();
+    SgbmConfig {
+        num_disparities: raw.max_disparity_px.unwrap_or(usual.num_disparities),
+        max_sigma_over_range: raw.max_sigma_over_range.unwrap_or(usual.max_sigma_over_range),
+        ..usual
+    }
 }

@@ -122,7 +122,7 @@ pub(crate) fn load(path: &Path) -> Result<Rig, RigError> {
 pub(crate) fn parse(text: &str, path: &Path) -> Result<Rig, RigError> {
     let syntax = |error: toml::de::Error| RigError::Syntax {
         path: path.to_owned(),
-        message: error.to_string().trim_end().to_owned(),
+        message: one_line(text, &error),
     };
     let table: toml::Table = toml::from_str(text).map_err(syntax)?;
     let unknown: Vec<String> =
@@ -141,12 +141,28 @@ pub(crate) fn parse(text: &str, path: &Path) -> Result<Rig, RigError> {
     build(raw, path)
 }
 
+/// What the TOML reader says, with the line that it says it of.
+fn one_line(text: &str, error: &toml::de::Error) -> String {
+    let message = error.message().replace('\n', ", ");
+    match error.span().and_then(|span| text.get(..span.start)) {
+        Some(before) => {
+            let number = before.matches('\n').count();
+            let line = text.lines().nth(number).unwrap_or_default().trim();
+            format!("line {} ({line}): {message}", number + 1)
+        }
+        None => message,
+    }
+}
+
 fn values(path: &Path, problems: Vec<String>) -> RigError {
     RigError::Values { path: path.to_owned(), problems }
 }
 
 fn check(raw: &RawRig) -> Vec<String> {
     let mut checks = Checks::new();
+    if raw.name.trim().is_empty() {
+        checks.problem(format!("name is {:?}, needed is a word for reports", raw.name));
+    }
     check_camera(&mut checks, "left", &raw.left);
     check_camera(&mut checks, "right", &raw.right);
     if raw.left.image_size_px != raw.right.image_size_px {
@@ -202,7 +218,8 @@ fn check_stereo(checks: &mut Checks, stereo: &RawStereo) {
         return;
     }
     let baseline = Vector3::new(x, y, z).norm();
-    checks.range("stereo baseline", baseline, 0.005, 5.0, " (metres, not mm)");
+    let baseline_hint = " (the baseline in metres, not mm)";
+    checks.range("stereo.right_from_left_translation_m", baseline, 0.005, 5.0, baseline_hint);
     checks.range("stereo.right_from_left_translation_m[1]", y, x, -x, " (eyes one above the other)");
 }
 

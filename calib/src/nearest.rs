@@ -65,7 +65,9 @@ fn collect(table: &toml::Table, prefix: &str, known: &[&str], found: &mut Vec<Ke
 }
 
 fn has_children(key: &str, known: &[&str]) -> bool {
-    known.iter().any(|candidate| candidate.starts_with(&format!("{key}.")))
+    known
+        .iter()
+        .any(|candidate| candidate.starts_with(&format!("{key}.")))
 }
 
 /// Collects "key is value, allowed is range" for every value out of range; not-a-number always is.

@@ -571,7 +571,7 @@ mod tests {
             altitude: MslAltitude::from_m(22.25),
             above_home_m: 12.0,
             velocity_ned_m_s: Vector3::new(5.25, -1.5, 0.25),
-            heading_rad: Some(1.570_796_326_794_896_6),
+            heading_rad: Some(std::f64::consts::FRAC_PI_2),
         }
     }
 

@@ -58,11 +58,12 @@ impl AlarmDesk {
         Self { uav, told: BTreeMap::new() }
     }
 
-    /// The alarms that are due. `situate` places a fire on the Earth.
+    /// The alarms that are due. `situate` places a fire on the Earth; one that is nowhere on it is
+    /// not told.
     pub fn due(
         &mut self,
         fires: &[Fire],
-        mut situate: impl FnMut(&Fire) -> Situation,
+        mut situate: impl FnMut(&Fire) -> Option<Situation>,
     ) -> Vec<Alarm> {
         let mut due = Vec::new();
         for fire in fires.iter().filter(|fire| fire.is_confirmed()) {
@@ -70,7 +71,9 @@ impl AlarmDesk {
             if never_told && fire.state == FireState::Out {
                 continue;
             }
-            let situation = situate(fire);
+            let Some(situation) = situate(fire) else {
+                continue;
+            };
             let covariance = fire.covariance();
             if self.is_due(fire, &situation, &covariance) {
                 due.push(self.write(fire, situation, &covariance));

@@ -1,9 +1,10 @@
 //! The link over IP: `POST /alarms` to the ground station.
 //!
-//! **In:** an [`Alarm`]. **Out:** [`HttpReceipt`], only when the ground says that it is stored.
+//! **In:** an [`Alarm`]. **Out:** a [`Receipt`], only when the ground says that it is stored.
 //! Blocking, bounded in time; one connection is kept open between alarms. No retry here: the outbox
 //! owns that. **Known limits:** plain HTTP (a VPN guards it); no redirects; no proxies.
 
+use super::{AlarmLink, LinkError, Receipt};
 use crate::alarm::Alarm;
 use crate::ground::Ping;
 use serde::Deserialize;
@@ -11,6 +12,8 @@ use std::time::Duration;
 use ureq::http::{Response, StatusCode};
 use ureq::{Agent, Body};
 
+/// Name of this link in the outbox.
+const LINK_NAME: &str = "http";
 /// Longest wait for a connection.
 const CONNECT: Duration = Duration::from_secs(2);
 /// Longest whole exchange. A disk that syncs slowly takes a second; beyond five the outbox tries
@@ -36,8 +39,7 @@ pub enum HttpError {
         /// What went wrong.
         source: Box<ureq::Error>,
     },
-    /// The ground has a reason not to take it. A retry of the same will end the same (4xx), or may
-    /// not (5xx).
+    /// The ground has a reason not to take it.
     #[error("ground {url} answered {status}: {reason}")]
     Refused {
         /// What was asked.
@@ -58,24 +60,23 @@ pub enum HttpError {
 }
 
 impl HttpError {
-    /// True when sending the same again can't help: the alarm itself is refused.
+    /// True when the ground will not have this very alarm; else the link or the ground is at fault.
     #[must_use]
-    pub fn is_permanent(&self) -> bool {
-        match self {
-            Self::Refused { status, .. } => matches!(status, 400 | 409 | 413 | 415 | 422),
-            Self::Url { .. } => true,
-            Self::Unreachable { .. } | Self::NoReceipt { .. } => false,
-        }
+    pub fn is_about_the_alarm(&self) -> bool {
+        matches!(
+            self,
+            Self::Refused {
+                status: 400 | 409 | 413,
+                ..
+            }
+        )
     }
 }
 
-/// The ground has this revision on its disk.
-#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
-pub struct HttpReceipt {
-    /// Alarm id.
-    pub id: String,
-    /// Revision.
-    pub revision: u32,
+#[derive(Deserialize)]
+struct Stored {
+    id: String,
+    revision: u32,
     stored: bool,
 }
 
@@ -130,8 +131,8 @@ impl HttpLink {
     /// Sends one revision; `Ok` only when the ground says that this revision is on its disk.
     ///
     /// # Errors
-    /// [`HttpError`]; see [`HttpError::is_permanent`].
-    pub fn send(&self, alarm: &Alarm) -> Result<HttpReceipt, HttpError> {
+    /// [`HttpError`]; see [`HttpError::is_about_the_alarm`].
+    pub fn send_alarm(&self, alarm: &Alarm) -> Result<Receipt, HttpError> {
         let url = format!("{}/alarms", self.base_url);
         let mut answer = self.post(
             &url,
@@ -144,17 +145,21 @@ impl HttpLink {
             .with_config()
             .limit(MAX_ANSWER)
             .read_to_vec();
-        let receipt = text
+        let stored = text
             .ok()
-            .and_then(|text| serde_json::from_slice::<HttpReceipt>(&text).ok());
-        let ours = |receipt: &HttpReceipt| {
-            let sent = &alarm.properties;
-            receipt.stored && receipt.id == sent.id && receipt.revision == sent.revision
-        };
-        receipt.filter(ours).ok_or(HttpError::NoReceipt {
-            url,
-            status: status.as_u16(),
-        })
+            .and_then(|text| serde_json::from_slice::<Stored>(&text).ok());
+        let sent = &alarm.properties;
+        match stored {
+            Some(Stored {
+                id,
+                revision,
+                stored: true,
+            }) if id == sent.id && revision == sent.revision => Ok(Receipt { id, revision }),
+            _ => Err(HttpError::NoReceipt {
+                url,
+                status: status.as_u16(),
+            }),
+        }
     }
 
     /// Tells where the aircraft is. Lost positions are not repeated: the next one is better.
@@ -177,6 +182,28 @@ impl HttpLink {
                 url: url.to_owned(),
                 source: Box::new(source),
             })
+    }
+}
+
+impl AlarmLink for HttpLink {
+    fn name(&self) -> &'static str {
+        LINK_NAME
+    }
+
+    fn send(&mut self, alarm: &Alarm) -> Result<Receipt, LinkError> {
+        self.send_alarm(alarm).map_err(|error| {
+            let (link, reason) = (LINK_NAME, error.to_string());
+            if !error.is_about_the_alarm() {
+                return LinkError::Unreachable { link, reason };
+            }
+            let sent = &alarm.properties;
+            LinkError::Refused {
+                link,
+                id: sent.id.clone(),
+                revision: sent.revision,
+                reason,
+            }
+        })
     }
 }
 
@@ -234,7 +261,7 @@ mod tests {
 
     #[test]
     fn only_a_receipt_for_this_very_revision_counts_as_stored() {
-        let sent = |answer| answering(answer).send(&alarm());
+        let sent = |answer| answering(answer).send_alarm(&alarm());
         let good = r#"201 Created|{"id":"gaochun-1","revision":1,"stored":true}"#;
         assert_eq!(sent(good).unwrap().revision, 1);
         for bad in [
@@ -255,15 +282,31 @@ mod tests {
     }
 
     #[test]
-    fn a_refusal_carries_the_grounds_words_and_says_whether_to_go_on() {
-        let refused =
-            answering(r#"409 Conflict|{"error":"numbering has restarted"}"#).send(&alarm());
-        let refused = refused.unwrap_err();
-        assert!(refused.is_permanent() && refused.to_string().contains("numbering has restarted"));
-        let busy = answering("503 Service Unavailable|")
-            .send(&alarm())
-            .unwrap_err();
-        assert!(!busy.is_permanent());
+    fn a_refused_alarm_is_told_from_a_link_that_fails() {
+        let outcome = |answer| answering(answer).send(&alarm()).unwrap_err();
+        match outcome(r#"409 Conflict|{"error":"numbering has restarted"}"#) {
+            LinkError::Refused {
+                id,
+                revision,
+                reason,
+                ..
+            } => {
+                assert_eq!((id.as_str(), revision), ("gaochun-1", 1));
+                assert!(reason.contains("numbering has restarted"), "{reason}");
+            }
+            other @ LinkError::Unreachable { .. } => panic!("{other}"),
+        }
+        for failing in ["503 Service Unavailable|", "404 Not Found|", "200 OK|hello"] {
+            assert!(
+                matches!(outcome(failing), LinkError::Unreachable { .. }),
+                "{failing}"
+            );
+        }
+        let mut nobody = HttpLink::new("http://127.0.0.1:9").unwrap();
+        assert!(matches!(
+            nobody.send(&alarm()),
+            Err(LinkError::Unreachable { .. })
+        ));
     }
 
     #[test]

@@ -57,7 +57,11 @@ impl Lookalike {
             dims: self.output.clone(),
             data_type: 1,
             name: "answer".to_owned(),
-            raw_data: self.answer.iter().flat_map(|value| value.to_le_bytes()).collect(),
+            raw_data: self
+                .answer
+                .iter()
+                .flat_map(|value| value.to_le_bytes())
+                .collect(),
         };
         Model {
             ir_version: 8,
@@ -68,11 +72,16 @@ impl Lookalike {
                 input: vec![value("data", self.input_type, &self.input)],
                 output: vec![value("output", 1, &self.output)],
             }),
-            opset_import: vec![Opset { version: self.opset }],
+            opset_import: vec![Opset {
+                version: self.opset,
+            }],
             metadata: self
                 .metadata
                 .iter()
-                .map(|(key, value)| Entry { key: (*key).to_owned(), value: value.clone() })
+                .map(|(key, value)| Entry {
+                    key: (*key).to_owned(),
+                    value: value.clone(),
+                })
                 .collect(),
         }
     }
@@ -80,8 +89,16 @@ impl Lookalike {
 
 fn value(name: &str, elem_type: i32, dims: &[i64]) -> Value {
     let dim = dims.iter().map(|length| Dim { value: *length }).collect();
-    let tensor = TensorType { elem_type, shape: Some(Shape { dim }) };
-    Value { name: name.to_owned(), kind: Some(Kind { tensor: Some(tensor) }) }
+    let tensor = TensorType {
+        elem_type,
+        shape: Some(Shape { dim }),
+    };
+    Value {
+        name: name.to_owned(),
+        kind: Some(Kind {
+            tensor: Some(tensor),
+        }),
+    }
 }
 
 #[derive(Message)]

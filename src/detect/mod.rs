@@ -124,6 +124,16 @@ pub trait Detector: Send {
     fn detect(&mut self, image: &LeftImage) -> Result<Vec<Detection>, DetectError>;
 }
 
+/// Loads the model that a mission names.
+///
+/// # Errors
+/// [`ModelError`] that names the file, what was expected and what was found.
+pub fn open(config: &DetectorConfig) -> Result<Box<dyn Detector>, ModelError> {
+    let detector = OnnxDetector::load(config)?;
+    tracing::info!(info = ?detector.info(), "model loaded");
+    Ok(Box::new(detector))
+}
+
 /// Why a frame has no result. The next frame may have one: count it and go on.
 #[derive(Debug, thiserror::Error)]
 pub enum DetectError {
@@ -163,4 +173,18 @@ pub enum DetectError {
         #[from]
         source: opencv::Error,
     },
+}
+
+impl DetectError {
+    /// A word for counters.
+    #[must_use]
+    pub fn name(&self) -> &'static str {
+        match self {
+            Self::Image { .. } => "image",
+            Self::NotFinite { .. } => "not_finite",
+            Self::Shape { .. } => "shape",
+            Self::Inference { .. } => "inference",
+            Self::OpenCv { .. } => "opencv",
+        }
+    }
 }

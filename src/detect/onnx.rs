@@ -389,12 +389,20 @@ mod tests {
     }
 
     fn refusal(model: &Lookalike) -> String {
-        load(model).err().map(|error| error.to_string()).unwrap_or_else(|| "loaded".to_owned())
+        load(model)
+            .err()
+            .map(|error| error.to_string())
+            .unwrap_or_else(|| "loaded".to_owned())
     }
 
     fn grey(width: i32, height: i32) -> LeftImage {
-        let bgr = Mat::new_rows_cols_with_default(height, width, CV_8UC3, Scalar::all(90.0)).unwrap();
-        LeftImage { at: ServiceTime::from_unix_ns(0), sequence: 0, bgr }
+        let bgr =
+            Mat::new_rows_cols_with_default(height, width, CV_8UC3, Scalar::all(90.0)).unwrap();
+        LeftImage {
+            at: ServiceTime::from_unix_ns(0),
+            sequence: 0,
+            bgr,
+        }
     }
 
     #[test]
@@ -409,8 +417,18 @@ mod tests {
         assert_eq!(found.len(), 1);
         assert_eq!(found[0].class, DetectionClass::Fire);
         // Scale 0.325, bars of 91 rows: (128 - 0) / 0.325 - 0.5, (176 - 91) / 0.325 - 0.5, 64 / 0.325.
-        let BoxPx { x, y, width, height } = found[0].box_px;
-        for (got, want) in [(x, 393.346), (y, 261.038), (width, 196.923), (height, 196.923)] {
+        let BoxPx {
+            x,
+            y,
+            width,
+            height,
+        } = found[0].box_px;
+        for (got, want) in [
+            (x, 393.346),
+            (y, 261.038),
+            (width, 196.923),
+            (height, 196.923),
+        ] {
             assert!((got - want).abs() < 1e-3, "{:?}", found[0].box_px);
         }
         assert_eq!(detector.info().execution_provider, "CPUExecutionProvider");
@@ -422,12 +440,9 @@ mod tests {
         if no_runtime() {
             return;
         }
-        let model = Lookalike::nanodet_plus().with_box(2704 + 13 * 26 + 13, 1, 0.9, 0).with_box(
-            26 * 52 + 26,
-            0,
-            0.8,
-            1,
-        );
+        let model = Lookalike::nanodet_plus()
+            .with_box(2704 + 13 * 26 + 13, 1, 0.9, 0)
+            .with_box(26 * 52 + 26, 0, 0.8, 1);
         let found = load(&model).unwrap().detect(&grey(1280, 720)).unwrap();
         // The same answer nine times: one per view, none at the same place.
         assert_eq!(found.len(), 9, "{found:?}");
@@ -441,7 +456,11 @@ mod tests {
         for bad in [f32::NAN, f32::INFINITY] {
             let mut model = Lookalike::nanodet_plus();
             model.answer[99] = bad;
-            assert!(refusal(&model).contains("not finite"), "{}", refusal(&model));
+            assert!(
+                refusal(&model).contains("not finite"),
+                "{}",
+                refusal(&model)
+            );
         }
     }
 
@@ -453,12 +472,19 @@ mod tests {
         let model = Lookalike::nanodet_plus();
         let claimed = load_with(&model, |config| config.family = Some(Family::Yolov8));
         let message = claimed.err().unwrap().to_string();
-        assert!(message.contains("[1, 3598, 34]") && message.contains("3549"), "{message}");
+        assert!(
+            message.contains("[1, 3598, 34]") && message.contains("3549"),
+            "{message}"
+        );
 
         let three = r#"["fire", "smoke", "other"]"#.to_owned();
         let mut model = Lookalike::nanodet_plus();
         model.metadata[1].1 = three;
-        assert!(refusal(&model).contains("3 class names but 2 score columns"), "{}", refusal(&model));
+        assert!(
+            refusal(&model).contains("3 class names but 2 score columns"),
+            "{}",
+            refusal(&model)
+        );
 
         for (input, input_type) in [
             (vec![1, 416, 416, 3], 1),
@@ -467,8 +493,16 @@ mod tests {
             (vec![3, 416, 416], 1),
             (vec![4, 3, 416, 416], 1),
         ] {
-            let model = Lookalike { input, input_type, ..Lookalike::nanodet_plus() };
-            assert!(refusal(&model).contains("one input [1, 3, rows, columns]"), "{}", refusal(&model));
+            let model = Lookalike {
+                input,
+                input_type,
+                ..Lookalike::nanodet_plus()
+            };
+            assert!(
+                refusal(&model).contains("one input [1, 3, rows, columns]"),
+                "{}",
+                refusal(&model)
+            );
         }
     }
 
@@ -477,10 +511,24 @@ mod tests {
         if no_runtime() {
             return;
         }
-        let operator = Lookalike { operator: "Ignite", ..Lookalike::nanodet_plus() };
-        assert!(refusal(&operator).contains("Ignite"), "{}", refusal(&operator));
-        let opset = Lookalike { opset: 999, ..Lookalike::nanodet_plus() };
-        assert!(refusal(&opset).contains("ai.onnx 999"), "{}", refusal(&opset));
+        let operator = Lookalike {
+            operator: "Ignite",
+            ..Lookalike::nanodet_plus()
+        };
+        assert!(
+            refusal(&operator).contains("Ignite"),
+            "{}",
+            refusal(&operator)
+        );
+        let opset = Lookalike {
+            opset: 999,
+            ..Lookalike::nanodet_plus()
+        };
+        assert!(
+            refusal(&opset).contains("ai.onnx 999"),
+            "{}",
+            refusal(&opset)
+        );
     }
 
     #[test]
@@ -503,10 +551,14 @@ mod tests {
         }
         let mut detector = load(&Lookalike::nanodet_plus()).unwrap();
         let mut image = grey(64, 64);
-        image.bgr = Mat::new_rows_cols_with_default(64, 64, opencv::core::CV_8UC1, Scalar::all(0.0))
-            .unwrap();
+        image.bgr =
+            Mat::new_rows_cols_with_default(64, 64, opencv::core::CV_8UC1, Scalar::all(0.0))
+                .unwrap();
         let error = detector.detect(&image).unwrap_err();
-        assert_eq!(error.to_string(), "image is 64x64 CV_8UC1, the detector reads 8-bit BGR");
+        assert_eq!(
+            error.to_string(),
+            "image is 64x64 CV_8UC1, the detector reads 8-bit BGR"
+        );
         image.bgr = Mat::default();
         assert!(detector.detect(&image).is_err());
         assert!(detector.detect(&grey(640, 480)).unwrap().is_empty());
@@ -520,7 +572,10 @@ mod tests {
         for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
             values[777] = bad;
             let error = check_finite(&values).unwrap_err();
-            assert!(matches!(error, DetectError::NotFinite { count: 1, of: 1000 }));
+            assert!(matches!(
+                error,
+                DetectError::NotFinite { count: 1, of: 1000 }
+            ));
         }
         values[777] = f32::MAX;
         assert!(check_finite(&values).is_ok());

@@ -2,6 +2,7 @@
 //! at once.
 
 use emberfix_calib::{KeyProblem, unknown_keys};
+use emberfix_mav::{LinkUrl, LinkUrlError};
 use serde::Deserialize;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -62,7 +63,7 @@ pub struct GroundConfig {
 /// The ground agent's end of MAVLink.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct MavlinkConfig {
-    pub url: String,
+    pub url: LinkUrl,
     pub system_id: u8,
     pub component_id: u8,
 }
@@ -234,8 +235,13 @@ fn check_door(address: SocketAddr, allow_remote: bool, problems: &mut Vec<String
 fn check_mavlink(raw: RawMavlink, problems: &mut Vec<String>) -> Option<MavlinkConfig> {
     let system_id = id("mavlink.system_id", raw.system_id, problems);
     let component_id = id("mavlink.component_id", raw.component_id, problems);
+    let url = raw
+        .url
+        .parse()
+        .map_err(|error: LinkUrlError| problems.push(format!("mavlink.url: {error}")))
+        .ok();
     Some(MavlinkConfig {
-        url: raw.url,
+        url: url?,
         system_id: system_id?,
         component_id: component_id?,
     })

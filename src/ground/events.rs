@@ -5,6 +5,7 @@
 //! | `hello` | name of the store, the ground's clock; first on every stream | |
 //! | `alarm` | the alarm's GeoJSON Feature | row of the store |
 //! | `track` | an aircraft's [`super::Ping`] | |
+//! | `refused` | time, link and reason of an alarm that was not taken | |
 //! | `time` | the ground's clock, every [`PULSE`]: a client that misses it has lost the line | |
 //!
 //! A stream without `Last-Event-ID` begins with every incident as it stands now; with it, it tells
@@ -12,7 +13,7 @@
 //! memory and loses no alarm: it reads on where it was, or the door closes on it and it resumes.
 
 use super::store::{Row, Store, StoreError};
-use super::{Station, now};
+use super::{Notice, Station, now};
 use axum::response::sse::Event;
 use std::convert::Infallible;
 use std::sync::Arc;
@@ -42,7 +43,7 @@ pub(super) fn open(station: &Arc<Station>, last_event_id: Option<i64>) -> Option
     let stream = Stream {
         cursor: Cursor::new(station, last_event_id),
         newest_row: station.newest_row.subscribe(),
-        positions: station.positions.subscribe(),
+        notices: station.notices.subscribe(),
         stopping: station.stopping.subscribe(),
         sender,
         place,
@@ -118,8 +119,8 @@ struct Ended;
 /// What a stream waits for.
 enum News {
     Alarms,
-    Position(Arc<str>),
-    /// Positions that came faster than this client reads.
+    Notice(Notice),
+    /// Notices that came faster than this client reads.
     Skipped,
     Pulse,
 }
@@ -127,7 +128,7 @@ enum News {
 struct Stream {
     cursor: Cursor,
     newest_row: watch::Receiver<i64>,
-    positions: broadcast::Receiver<Arc<str>>,
+    notices: broadcast::Receiver<Notice>,
     stopping: watch::Receiver<bool>,
     sender: mpsc::Sender<Result<Event, Infallible>>,
     place: Place,
@@ -157,8 +158,8 @@ impl Stream {
         loop {
             match self.next(&mut pulse).await? {
                 News::Alarms => self.tell_alarms().await?,
-                News::Position(position) => {
-                    self.tell(Event::default().event("track").data(&*position))
+                News::Notice(notice) => {
+                    self.tell(Event::default().event(notice.kind).data(&*notice.data))
                         .await?;
                 }
                 News::Skipped => {}
@@ -173,8 +174,8 @@ impl Stream {
             () = stopped => Err(Ended),
             () = self.sender.closed() => Err(Ended),
             changed = self.newest_row.changed() => changed.map(|()| News::Alarms).map_err(|_| Ended),
-            position = self.positions.recv() => match position {
-                Ok(position) => Ok(News::Position(position)),
+            notice = self.notices.recv() => match notice {
+                Ok(notice) => Ok(News::Notice(notice)),
                 Err(RecvError::Lagged(_)) => Ok(News::Skipped),
                 Err(RecvError::Closed) => Err(Ended),
             },

@@ -28,6 +28,8 @@ use std::time::Duration;
 const MAX_BODY: usize = 64 * 1024;
 /// From the end of the head to the head of the answer; a stream's events come after that.
 const MAX_REQUEST_TIME: Duration = Duration::from_secs(10);
+/// Source of alarms as the store names it.
+const LINK_NAME: &str = "http";
 /// Incidents read from the store at once.
 const PAGE: u32 = 512;
 
@@ -140,11 +142,30 @@ async fn guarded(mut response: Response) -> Response {
     response
 }
 
+/// Why a body was not read.
+#[derive(Debug, thiserror::Error)]
+enum BodyError {
+    #[error("Content-Type is {kind:?}, allowed are application/json and application/geo+json")]
+    Kind { kind: String },
+    #[error("the body is larger than {MAX_BODY} bytes")]
+    Large,
+    #[error("the body did not come: {source}")]
+    Broken { source: BytesRejection },
+}
+
+impl BodyError {
+    fn answer(&self) -> Response {
+        let status = match self {
+            Self::Kind { .. } => StatusCode::UNSUPPORTED_MEDIA_TYPE,
+            Self::Large => StatusCode::PAYLOAD_TOO_LARGE,
+            Self::Broken { source } => source.status(),
+        };
+        refusal(status, self)
+    }
+}
+
 /// The body, if it is small enough and calls itself JSON.
-fn json_body(
-    headers: &HeaderMap,
-    body: Result<Bytes, BytesRejection>,
-) -> Result<Bytes, Box<Response>> {
+fn json_body(headers: &HeaderMap, body: Result<Bytes, BytesRejection>) -> Result<Bytes, BodyError> {
     let kind = headers
         .get(header::CONTENT_TYPE)
         .and_then(|kind| kind.to_str().ok());
@@ -155,20 +176,13 @@ fn json_body(
         .unwrap_or_default()
         .trim();
     if !["application/json", "application/geo+json"].contains(&kind) {
-        let reason = format!(
-            "Content-Type is {kind:?}, allowed are application/json and application/geo+json"
-        );
-        return Err(Box::new(refusal(
-            StatusCode::UNSUPPORTED_MEDIA_TYPE,
-            reason,
-        )));
+        return Err(BodyError::Kind {
+            kind: kind.to_owned(),
+        });
     }
-    body.map_err(|rejection| match rejection.status() {
-        StatusCode::PAYLOAD_TOO_LARGE => Box::new(refusal(
-            StatusCode::PAYLOAD_TOO_LARGE,
-            format!("the body is larger than {MAX_BODY} bytes"),
-        )),
-        status => Box::new(refusal(status, rejection.body_text())),
+    body.map_err(|source| match source.status() {
+        StatusCode::PAYLOAD_TOO_LARGE => BodyError::Large,
+        _ => BodyError::Broken { source },
     })
 }
 
@@ -179,14 +193,14 @@ async fn post_alarm(
 ) -> Response {
     let body = match json_body(&headers, body) {
         Ok(body) => body,
-        Err(refused) => {
-            station.counters.refused.fetch_add(1, Ordering::Relaxed);
-            return *refused;
+        Err(error) => {
+            station.refuse(&error, LINK_NAME);
+            return error.answer();
         }
     };
-    let (alarm, kept) = match station.receive(&body, "http", Completeness::Full).await {
+    let (alarm, kept) = match station.receive(&body, LINK_NAME, Completeness::Full).await {
         Ok(received) => received,
-        Err(error) => return refused(&error),
+        Err(error) => return not_taken(&error),
     };
     let status = match kept {
         Kept::New { .. } => StatusCode::CREATED,
@@ -197,8 +211,7 @@ async fn post_alarm(
     (status, axum::Json(receipt)).into_response()
 }
 
-fn refused(error: &ReceiveError) -> Response {
-    tracing::warn!(%error, "an alarm was refused");
+fn not_taken(error: &ReceiveError) -> Response {
     let status = match error {
         ReceiveError::Alarm(_) | ReceiveError::Covariance { .. } => StatusCode::BAD_REQUEST,
         ReceiveError::Store(StoreError::Conflict { .. }) => StatusCode::CONFLICT,
@@ -214,7 +227,7 @@ async fn post_track(
 ) -> Response {
     let body = match json_body(&headers, body) {
         Ok(body) => body,
-        Err(refused) => return *refused,
+        Err(error) => return error.answer(),
     };
     match Ping::from_json(&body).and_then(|ping| station.moved(ping, Source::Service)) {
         Ok(()) => StatusCode::NO_CONTENT.into_response(),

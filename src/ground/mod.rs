@@ -37,6 +37,7 @@ pub use tracks::{Ping, PingError};
 
 use crate::alarm::{Alarm, AlarmError};
 use emberfix_frames::{CovarianceError, ServiceTime};
+use emberfix_mav::{Link, LinkError};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -47,8 +48,10 @@ use tokio::sync::{broadcast, watch};
 use tokio::task::JoinHandle;
 use tracks::{Source, Tracks};
 
-/// Positions that a slow event stream may lag behind; the oldest are then skipped, for it.
-const POSITIONS_QUEUED: usize = 64;
+/// Notices that a slow event stream may lag behind; the oldest are then skipped, for it.
+const NOTICES_QUEUED: usize = 64;
+/// Longest reason of a refusal that is shown, characters: it may quote what came.
+const MAX_REASON: usize = 300;
 /// How long open requests may go on after a stop was asked for.
 const GRACE: Duration = Duration::from_secs(3);
 
@@ -69,6 +72,9 @@ pub enum GroundError {
         /// What the system said.
         source: std::io::Error,
     },
+    /// The MAVLink port can't be opened.
+    #[error(transparent)]
+    Mavlink(#[from] LinkError),
     /// The HTTP server ended.
     #[error("the HTTP server ended: {source}")]
     Serve {
@@ -146,6 +152,15 @@ impl Ground {
     /// [`GroundError`] when the store or the address can't be opened.
     pub async fn start(config: GroundConfig) -> Result<Self, GroundError> {
         let station = Arc::new(Station::open(&config)?);
+        if let Some(mavlink) = config.mavlink {
+            let link = Link::open(&mavlink.url).await?;
+            tokio::spawn(mavlink::run(
+                Arc::clone(&station),
+                link,
+                mavlink,
+                config.uavs,
+            ));
+        }
         let in_use = |source| GroundError::Listen {
             address: config.listen,
             source,
@@ -157,12 +172,12 @@ impl Ground {
         let names = Arc::from(config.host_names.as_slice());
         let app = http::router(Arc::clone(&station), names);
         let mut stopping = station.stopping.subscribe();
-        let server = axum::serve(listener::Bounded::new(socket), app)
-            .with_graceful_shutdown(async move { drop(stopping.wait_for(|stop| *stop).await) });
+        let server = axum::serve(
+            listener::Bounded::new(socket, listener::Limits::default()),
+            app,
+        )
+        .with_graceful_shutdown(async move { drop(stopping.wait_for(|stop| *stop).await) });
         let server = tokio::spawn(async move { server.await });
-        if let Some(link) = config.mavlink {
-            tokio::spawn(mavlink::run(Arc::clone(&station), link, config.uavs));
-        }
         Ok(Self {
             address,
             station,
@@ -209,6 +224,15 @@ fn served(ended: Result<std::io::Result<()>, tokio::task::JoinError>) -> Result<
     Err(GroundError::Serve { source })
 }
 
+/// Something that open event streams tell, and that is not repeated to later ones.
+#[derive(Debug, Clone)]
+struct Notice {
+    /// Name of the event.
+    kind: &'static str,
+    /// JSON on one line.
+    data: Arc<str>,
+}
+
 /// What every edge of the ground station shares.
 #[derive(Debug)]
 pub(crate) struct Station {
@@ -216,8 +240,8 @@ pub(crate) struct Station {
     tracks: Mutex<Tracks>,
     /// Newest row that streams should tell; streams read the rows themselves, from the store.
     newest_row: watch::Sender<i64>,
-    /// Latest positions as JSON. Bound: [`POSITIONS_QUEUED`]; loss: oldest first, per stream.
-    positions: broadcast::Sender<Arc<str>>,
+    /// What is told once. Bound: [`NOTICES_QUEUED`]; loss: oldest first, per stream.
+    notices: broadcast::Sender<Notice>,
     stopping: watch::Sender<bool>,
     counters: Counters,
     mavlink: Mutex<Option<mavlink::LinkHealth>>,
@@ -239,7 +263,7 @@ impl Station {
             store: Arc::new(store),
             tracks: Mutex::default(),
             newest_row: watch::Sender::new(newest),
-            positions: broadcast::Sender::new(POSITIONS_QUEUED),
+            notices: broadcast::Sender::new(NOTICES_QUEUED),
             stopping: watch::Sender::new(false),
             counters: Counters::default(),
             mavlink: Mutex::default(),
@@ -255,11 +279,13 @@ impl Station {
     ) -> Result<(Alarm, Kept), ReceiveError> {
         let kept = self.check_and_keep(raw, link, completeness).await;
         match &kept {
-            Ok((_, Kept::New { .. })) => &self.counters.stored,
-            Ok((_, Kept::Again)) => &self.counters.repeated,
-            Err(_) => &self.counters.refused,
-        }
-        .fetch_add(1, Ordering::Relaxed);
+            Ok((_, Kept::New { .. })) => self.counters.stored.fetch_add(1, Ordering::Relaxed),
+            Ok((_, Kept::Again)) => self.counters.repeated.fetch_add(1, Ordering::Relaxed),
+            Err(error) => {
+                self.refuse(error, link);
+                return kept;
+            }
+        };
         kept
     }
 
@@ -303,10 +329,29 @@ impl Station {
     /// Takes a position and passes it on to the open streams.
     fn moved(&self, ping: Ping, source: Source) -> Result<(), PingError> {
         if let Some(told) = self.tracks().take(ping, source)? {
-            // No receiver only means that nobody watches.
-            let _ = self.positions.send(told.into());
+            self.tell(Notice {
+                kind: "track",
+                data: told.into(),
+            });
         }
         Ok(())
+    }
+
+    /// Counts a refusal and shows it: an alarm that did not get in is news, too.
+    fn refuse(&self, error: &dyn std::error::Error, link: &'static str) {
+        self.counters.refused.fetch_add(1, Ordering::Relaxed);
+        tracing::warn!(%error, link, "an alarm was refused");
+        let reason: String = error.to_string().chars().take(MAX_REASON).collect();
+        let data = serde_json::json!({ "at": now().rfc3339(), "link": link, "reason": reason });
+        self.tell(Notice {
+            kind: "refused",
+            data: data.to_string().into(),
+        });
+    }
+
+    fn tell(&self, notice: Notice) {
+        // No receiver only means that nobody watches.
+        let _ = self.notices.send(notice);
     }
 
     fn tracks(&self) -> MutexGuard<'_, Tracks> {

@@ -2,9 +2,12 @@
 
 use super::store::tests::feature;
 use super::{Ground, GroundConfig, Overrides, Ping};
-use crate::alarm::Alarm;
+use crate::alarm::{Alarm, FireId};
 use crate::deliver::http::{HttpError, HttpLink};
-use emberfix_frames::ServiceTime;
+use crate::deliver::spatial;
+use emberfix_frames::{BootTime, MslAltitude, ServiceTime, Vector3};
+use emberfix_mav::telemetry::{CommandAck, CommandInt, CommandResult, GlobalPosition};
+use emberfix_mav::{Address, Chunk, Encoder, Inbox, MavMessage, Peer, Telemetry, outgoing};
 use std::net::SocketAddr;
 use std::path::Path;
 use std::time::Duration;
@@ -31,7 +34,7 @@ fn alarm(id: &str, revision: u32) -> Alarm {
 
 async fn send(address: SocketAddr, alarm: Alarm) -> Result<(), HttpError> {
     let link = HttpLink::new(&format!("http://{address}")).unwrap();
-    tokio::task::spawn_blocking(move || link.send(&alarm).map(|_| ()))
+    tokio::task::spawn_blocking(move || link.send_alarm(&alarm).map(|_| ()))
         .await
         .unwrap()
 }
@@ -298,4 +301,182 @@ async fn a_stop_ends_open_streams_at_once() {
     let asked = std::time::Instant::now();
     ground.stop().await.unwrap();
     assert!(asked.elapsed() < super::GRACE, "it waited for the stream");
+}
+
+/// The aircraft's side of MAVLink: a bare UDP socket.
+struct Aircraft {
+    socket: tokio::net::UdpSocket,
+    encoder: Encoder,
+    inbox: Inbox,
+}
+
+impl Aircraft {
+    async fn new(port: u16) -> Self {
+        let socket = tokio::net::UdpSocket::bind("127.0.0.1:0").await.unwrap();
+        socket.connect(("127.0.0.1", port)).await.unwrap();
+        let encoder = Encoder::new(Address::new(7, 191));
+        Self {
+            socket,
+            encoder,
+            inbox: Inbox::new(),
+        }
+    }
+
+    async fn say(&mut self, message: &MavMessage) {
+        self.socket
+            .send(&self.encoder.encode(message))
+            .await
+            .unwrap();
+    }
+
+    /// The next message that `wanted` takes.
+    async fn hear<T>(&mut self, wanted: impl Fn(Address, &Telemetry) -> Option<T>) -> T {
+        let heard = async {
+            loop {
+                let mut bytes = vec![0; 2048];
+                let length = self.socket.recv(&mut bytes).await.unwrap();
+                bytes.truncate(length);
+                let from = Peer::Connection(0);
+                for received in self.inbox.take(&Chunk { from, bytes }) {
+                    let telemetry = received.telemetry.unwrap();
+                    if let Some(found) = wanted(received.frame.sender(), &telemetry) {
+                        return found;
+                    }
+                }
+            }
+        };
+        tokio::time::timeout(PATIENCE, heard).await.unwrap()
+    }
+
+    async fn tell(&mut self, order: &CommandInt) -> CommandAck {
+        self.say(&outgoing::command_int(order).unwrap()).await;
+        self.hear(|_, telemetry| match telemetry {
+            Telemetry::CommandAck(ack) => Some(*ack),
+            _ => None,
+        })
+        .await
+    }
+}
+
+async fn start_with_mavlink(folder: &Path) -> (Ground, u16) {
+    let free = std::net::UdpSocket::bind("127.0.0.1:0")
+        .unwrap()
+        .local_addr()
+        .unwrap()
+        .port();
+    let overrides = Overrides {
+        listen: "127.0.0.1:0".parse().ok(),
+        mavlink_url: Some(format!("udpin:127.0.0.1:{free}")),
+        ..Overrides::default()
+    };
+    let text = format!("data_dir = {folder:?}\n[[uav]]\nsystem_id = 7\nname = \"a\"");
+    let config = GroundConfig::parse(&text, Path::new("test.toml"), overrides).unwrap();
+    (Ground::start(config).await.unwrap(), free)
+}
+
+#[tokio::test]
+async fn an_alarm_over_mavlink_is_acknowledged_stored_and_shown_with_its_doubt() {
+    let folder = tempfile::tempdir().unwrap();
+    let (ground, port) = start_with_mavlink(folder.path()).await;
+    let mut aircraft = Aircraft::new(port).await;
+    aircraft.say(&outgoing::companion_heartbeat(true)).await;
+    let agent = aircraft
+        .hear(|sender, telemetry| matches!(telemetry, Telemetry::Heartbeat(_)).then_some(sender))
+        .await;
+    assert_eq!(agent, Address::new(254, 191));
+
+    let order = spatial::encode(&alarm("a-3", 2), agent, super::now()).unwrap();
+    let receipt = spatial::receipt(FireId(3), 2);
+    for _ in 0..2 {
+        let ack = aircraft.tell(&order).await;
+        assert_eq!(
+            (ack.result, ack.result_param2),
+            (CommandResult::Accepted, receipt)
+        );
+        assert_eq!(ack.target, Address::new(7, 191));
+    }
+    let mut events = Events::open(ground.address(), None).await;
+    let feature = events.next("alarm").await.1;
+    assert_eq!(feature["properties"]["id"], "a-3");
+    assert_eq!(feature["properties"]["degraded"][0], "mavlink_summary");
+    let longitude = feature["geometry"]["coordinates"][0].as_f64().unwrap();
+    // Half of MAVLink's step of 1e-7 degrees.
+    assert!((longitude - 119.112017).abs() <= 0.51e-7, "{longitude}");
+    ground.stop().await.unwrap();
+}
+
+#[tokio::test]
+async fn a_command_for_someone_else_or_without_a_place_is_never_stored() {
+    let folder = tempfile::tempdir().unwrap();
+    let (ground, port) = start_with_mavlink(folder.path()).await;
+    let mut aircraft = Aircraft::new(port).await;
+    let ground_agent = Address::new(254, 191);
+    let good = spatial::encode(&alarm("a-3", 2), ground_agent, super::now()).unwrap();
+    let elsewhere = CommandInt {
+        target: Address::new(255, 190),
+        ..good
+    };
+    aircraft
+        .say(&outgoing::command_int(&elsewhere).unwrap())
+        .await;
+    let nowhere = CommandInt {
+        x: i32::MAX,
+        ..good
+    };
+    let ack = aircraft.tell(&nowhere).await;
+    assert_eq!(ack.result, CommandResult::Denied);
+    let (_, collection) = get(ground.address(), "/alarms.geojson").await;
+    assert!(collection.contains("\"features\":[]"), "{collection}");
+    ground.stop().await.unwrap();
+}
+
+#[tokio::test]
+async fn an_aircraft_heard_over_mavlink_is_drawn_at_its_ellipsoid_height() {
+    let folder = tempfile::tempdir().unwrap();
+    let (ground, port) = start_with_mavlink(folder.path()).await;
+    let mut events = Events::open(ground.address(), None).await;
+    events.next("hello").await;
+    let position = GlobalPosition {
+        boot: BootTime::from_ms(1000),
+        latitude_deg: 31.409_422_2,
+        longitude_deg: 119.112_016_7,
+        altitude: MslAltitude::from_m(20.0),
+        above_home_m: 10.0,
+        velocity_ned_m_s: Vector3::zeros(),
+        heading_rad: Some(std::f64::consts::FRAC_PI_2),
+    };
+    Aircraft::new(port)
+        .await
+        .say(&outgoing::global_position(&position))
+        .await;
+    let ping = events.next("track").await.1;
+    assert_eq!(
+        (&ping["uav"], &ping["heading_deg"]),
+        (&"a".into(), &90.0.into())
+    );
+    // EGM96 at Gaochun is 2.355 m; the message carries millimetres.
+    let height = ping["height_ellipsoid_m"].as_f64().unwrap();
+    assert!((height - 22.355).abs() < 0.01, "{height}");
+    ground.stop().await.unwrap();
+}
+
+#[tokio::test]
+async fn a_refused_alarm_is_news_on_the_stream() {
+    let folder = tempfile::tempdir().unwrap();
+    let ground = start(folder.path()).await;
+    let mut events = Events::open(ground.address(), None).await;
+    events.next("hello").await;
+    let first = feature("a-1", 1, "2026-03-01T12:00:01Z");
+    assert_eq!(post(ground.address(), "/alarms", &first).await.0, 201);
+    let restarted = feature("a-1", 1, "2026-03-01T13:00:01Z");
+    assert_eq!(post(ground.address(), "/alarms", &restarted).await.0, 409);
+    let told = events.next("refused").await.1;
+    assert!(
+        told["reason"]
+            .as_str()
+            .unwrap()
+            .contains("numbering has restarted"),
+        "{told}"
+    );
+    ground.stop().await.unwrap();
 }

@@ -189,17 +189,17 @@ pub(crate) struct BlockReader {
 
 impl BlockReader {
     pub fn new() -> Self {
+        Self::knowing(Dictionary::default())
+    }
+
+    /// For a stream whose channels are known already.
+    pub fn knowing(dictionary: Dictionary) -> Self {
         Self {
             state: State::Searching(Vec::new()),
-            dictionary: Dictionary::default(),
+            dictionary,
             offset: 0,
             taken: 0,
         }
-    }
-
-    /// True once the magic has been seen.
-    pub fn has_begun(&self) -> bool {
-        !matches!(self.state, State::Searching(_))
     }
 
     /// True once the footer has been seen, or nothing more can be understood.

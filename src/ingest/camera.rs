@@ -289,14 +289,14 @@ impl Grabber {
             });
         }
         let mut frames = Vec::with_capacity(2);
-        for index in 0..self.captures.len() {
+        for (index, grabbed) in arrivals.iter().enumerate() {
             let mut frame = Mat::default();
             let got = self.captures[index].retrieve_def(&mut frame);
             if !got.map_err(|source| self.failed(source))? || frame.empty() {
                 return Ok(None);
             }
             self.check_size((frame.cols(), frame.rows()))?;
-            let at = self.capture_time(index, arrivals[index]);
+            let at = self.capture_time(index, *grabbed);
             frames.push((frame, at));
         }
         let arrived = arrivals.last().map(|moment| moment.service);
@@ -344,7 +344,7 @@ impl Grabber {
         let (at, capture_clock) = match &self.address.device {
             CaptureDevice::File { start, .. } => (*start + position, CaptureClock::Stated),
             CaptureDevice::Gstreamer(_) if position.is_positive() => (
-                self.from_least_delay(arrived, position),
+                self.tied_by_least_delay(arrived, position),
                 CaptureClock::StreamPosition,
             ),
             CaptureDevice::Gstreamer(_) => (arrived, CaptureClock::Arrival),
@@ -357,7 +357,11 @@ impl Grabber {
     }
 
     /// Ties a stream position to our clock: the frame with the least delay had nearly none.
-    fn from_least_delay(&mut self, arrived: ServiceTime, position: SignedDuration) -> ServiceTime {
+    fn tied_by_least_delay(
+        &mut self,
+        arrived: ServiceTime,
+        position: SignedDuration,
+    ) -> ServiceTime {
         let origin = ServiceTime::from_unix_ns(0);
         let delay = (arrived - position) - origin;
         let least = self.least_delay.map_or(delay, |least| least.min(delay));
@@ -435,6 +439,175 @@ impl Backend {
             Self::V4l2 => "V4L2",
             Self::Gstreamer => "GStreamer",
             Self::Any => "video file",
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ingest::testing::{START_NS, at, picture, rig};
+    use opencv::core::Size;
+    use opencv::prelude::VideoWriterTrait;
+    use opencv::videoio::VideoWriter;
+    use std::path::Path;
+    use std::sync::Arc;
+
+    fn clock() -> ServiceClock {
+        Arc::new(|| at(0))
+    }
+
+    /// Five frames at 10 Hz: the left half dark, the right half bright.
+    fn write_video(path: &Path, width: i32, height: i32) {
+        let code = VideoWriter::fourcc('M', 'J', 'P', 'G').unwrap();
+        let name = path.to_string_lossy();
+        let size = Size::new(width, height);
+        let mut writer = VideoWriter::new_with_backend(
+            &*name,
+            videoio::CAP_OPENCV_MJPEG,
+            code,
+            10.0,
+            size,
+            true,
+        )
+        .unwrap();
+        for _ in 0..5 {
+            let mut frame = picture(width, height, 1);
+            let halves = [(0, 40.0), (width / 2, 200.0)];
+            for (column, grey) in halves {
+                let area = Rect::new(column, 0, width / 2, height);
+                let colour = opencv::core::Scalar::all(grey);
+                opencv::imgproc::rectangle(&mut frame, area, colour, -1, 8, 0).unwrap();
+            }
+            writer.write(&frame).unwrap();
+        }
+        writer.release().unwrap();
+    }
+
+    fn file_address(path: &Path) -> CaptureAddress {
+        let device = CaptureDevice::File {
+            path: path.to_owned(),
+            start: ServiceTime::from_unix_ns(START_NS),
+        };
+        CaptureAddress {
+            device,
+            format: CaptureFormat::default(),
+        }
+    }
+
+    #[test]
+    fn a_side_by_side_video_is_split_into_eyes_with_rising_times() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("pair.avi");
+        write_video(&path, 2560, 720);
+        let mut source = open(&file_address(&path), &rig(), clock()).unwrap();
+        let mut pairs = Vec::new();
+        while let Some(pair) = source.next_pair().unwrap() {
+            pairs.push(pair);
+        }
+        assert_eq!((pairs.len(), source.counters().delivered), (5, 5));
+        for two in pairs.windows(2) {
+            assert_eq!((two[1].at - two[0].at).as_millis(), 100);
+        }
+        let first = &pairs[0].value;
+        let right = first.right.as_ref().unwrap();
+        let ImageEncoding::Raw {
+            encoding,
+            width,
+            height,
+            step,
+        } = &first.left.encoding
+        else {
+            unreachable!("a camera gives pixels")
+        };
+        assert_eq!(
+            (encoding.as_str(), *width, *height, *step),
+            ("bgr8", 1280, 720, 3840)
+        );
+        // The JPEG inside the video may round a little.
+        assert!(first.left.bytes[1_000_000].abs_diff(40) < 5);
+        assert!(right.bytes[1_000_000].abs_diff(200) < 5);
+        let mut decoder = crate::ingest::decode::ImageDecoder::new(&rig());
+        decoder.left(&first.left).unwrap();
+        decoder.right(right).unwrap();
+    }
+
+    #[test]
+    fn a_camera_of_the_wrong_size_or_none_at_all_is_refused_at_once() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("small.avi");
+        write_video(&path, 640, 240);
+        let error = open(&file_address(&path), &rig(), clock())
+            .map(drop)
+            .unwrap_err();
+        assert!(matches!(
+            error,
+            SourceError::FrameSize {
+                found_px: (640, 240),
+                expected_px: (2560, 720),
+                ..
+            }
+        ));
+        let device = CaptureDevice::V4l2("/dev/video-none".to_owned());
+        let absent = CaptureAddress {
+            device,
+            format: CaptureFormat::default(),
+        };
+        let error = open(&absent, &rig(), clock()).map(drop).unwrap_err();
+        assert!(
+            matches!(
+                error,
+                SourceError::NotOpened {
+                    backend: "V4L2",
+                    ..
+                }
+            ),
+            "{error}"
+        );
+    }
+
+    #[test]
+    fn a_gstreamer_pipeline_is_a_live_camera() {
+        let pipeline = "videotestsrc is-live=true ! \
+                        video/x-raw,format=BGR,width=2560,height=720,framerate=20/1 ! appsink";
+        let address = CaptureAddress {
+            device: CaptureDevice::Gstreamer(pipeline.to_owned()),
+            format: CaptureFormat::default(),
+        };
+        let now: ServiceClock =
+            Arc::new(|| at((monotonic_now().as_millis() % 1_000_000_000) as i64));
+        let Ok(mut source) = open(&address, &rig(), now) else {
+            println!("skipped: no GStreamer with videotestsrc (gstreamer1.0-plugins-base)");
+            return;
+        };
+        let first = source.next_pair().unwrap().unwrap();
+        let second = source.next_pair().unwrap().unwrap();
+        assert!(second.at > first.at);
+        assert_eq!(second.value.skew, SignedDuration::ZERO);
+        assert_ne!(source.capture_clock(), CaptureClock::Stated);
+    }
+
+    #[test]
+    fn a_driver_stamp_is_used_only_when_it_is_the_monotonic_clocks() {
+        let grabbed = Moment {
+            service: at(1000),
+            monotonic: SignedDuration::from_secs(500),
+        };
+        let stamp = |seconds_ago: f64| grabbed.monotonic - seconds(seconds_ago);
+        assert_eq!(
+            from_monotonic(grabbed, stamp(0.03)),
+            (at(970), CaptureClock::DriverMonotonic)
+        );
+        for wrong in [
+            stamp(-0.1),
+            stamp(60.0),
+            SignedDuration::ZERO,
+            seconds(-0.001),
+        ] {
+            assert_eq!(
+                from_monotonic(grabbed, wrong),
+                (at(1000), CaptureClock::Arrival)
+            );
         }
     }
 }

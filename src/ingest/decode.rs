@@ -435,3 +435,270 @@ fn brightness(pixels: &Mat) -> opencv::Result<EyeHealth> {
         EyeHealth::Good
     })
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ingest::testing::{at, encode, picture};
+    use bytes::Bytes;
+    use opencv::imgcodecs::{
+        IMWRITE_JPEG_PROGRESSIVE, IMWRITE_JPEG_QUALITY, IMWRITE_JPEG_RST_INTERVAL,
+    };
+    use opencv::prelude::MatTraitConstManual;
+
+    const SIZE: (u32, u32) = (72, 50); // no multiple of a block, nor of 16
+
+    fn decoder() -> ImageDecoder {
+        ImageDecoder {
+            left_size_px: SIZE,
+            right_size_px: SIZE,
+            trailing_garbage: 0,
+        }
+    }
+
+    fn encoded(encoding: ImageEncoding, bytes: Vec<u8>) -> EncodedImage {
+        EncodedImage {
+            encoding,
+            bytes: Bytes::from(bytes),
+            at: at(0),
+        }
+    }
+
+    fn jpeg_bytes(parameters: &[i32]) -> Vec<u8> {
+        encode(".jpg", &picture(72, 50, 7), parameters)
+    }
+
+    fn left(bytes: &[u8]) -> Result<Mat, DecodeError> {
+        decoder().left(&encoded(ImageEncoding::Jpeg, bytes.to_vec()))
+    }
+
+    #[test]
+    fn whole_jpegs_of_every_common_kind_are_decoded_in_both_eyes() {
+        let kinds: [&[i32]; 4] = [
+            &[],
+            &[IMWRITE_JPEG_QUALITY, 100],
+            &[IMWRITE_JPEG_RST_INTERVAL, 3],
+            &[IMWRITE_JPEG_PROGRESSIVE, 1],
+        ];
+        for parameters in kinds {
+            let image = encoded(ImageEncoding::Jpeg, jpeg_bytes(parameters));
+            let bgr = decoder().left(&image).unwrap();
+            assert_eq!((bgr.cols(), bgr.rows(), bgr.channels()), (72, 50, 3));
+            let grey = decoder().right(&image).unwrap();
+            assert_eq!((grey.cols(), grey.rows(), grey.channels()), (72, 50, 1));
+        }
+        let mut grey = Mat::default();
+        imgproc::cvt_color_def(&picture(72, 50, 7), &mut grey, imgproc::COLOR_BGR2GRAY).unwrap();
+        assert_eq!(left(&encode(".jpg", &grey, &[])).unwrap().channels(), 3);
+    }
+
+    #[test]
+    fn a_jpeg_cut_off_anywhere_is_refused() {
+        for parameters in [&[][..], &[IMWRITE_JPEG_PROGRESSIVE, 1]] {
+            let whole = jpeg_bytes(parameters);
+            for length in 0..whole.len() {
+                assert!(
+                    left(&whole[..length]).is_err(),
+                    "{length} of {} bytes",
+                    whole.len()
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn a_jpeg_cut_off_and_ended_properly_is_still_refused() {
+        let whole = jpeg_bytes(&[]);
+        for length in (700..whole.len() - 3).step_by(7) {
+            let mut cut = whole[..length].to_vec();
+            cut.extend_from_slice(&[0xFF, 0xD9]);
+            assert!(left(&cut).is_err(), "{length} of {} bytes", whole.len());
+        }
+    }
+
+    #[test]
+    fn damage_that_breaks_the_huffman_code_is_found_and_none_panics() {
+        let whole = jpeg_bytes(&[]);
+        let begin = whole.windows(2).position(|w| w == [0xFF, 0xDA]).unwrap() + 14;
+        let (mut found, mut tried) = (0, 0);
+        for byte in begin..whole.len() - 2 {
+            let mut damaged = whole.clone();
+            damaged[byte] ^= 0x55;
+            tried += 1;
+            found += usize::from(left(&damaged).is_err());
+        }
+        // The code synchronises itself again after damage, and value bits may be anything: what is
+        // not found is a valid file of another picture, which chunk and link checksums are for.
+        assert!(found * 2 > tried, "{found} of {tried}");
+        for byte in 0..begin {
+            let mut damaged = whole.clone();
+            damaged[byte] ^= 0xFF;
+            drop(left(&damaged));
+        }
+    }
+
+    #[test]
+    fn garbage_after_the_end_is_counted_and_ignored() {
+        let mut bytes = jpeg_bytes(&[]);
+        bytes.extend_from_slice(b"garbage");
+        let mut decoder = decoder();
+        decoder.left(&encoded(ImageEncoding::Jpeg, bytes)).unwrap();
+        assert_eq!(decoder.trailing_garbage(), 1);
+    }
+
+    fn with_frame_header(change: impl FnOnce(&mut [u8])) -> Vec<u8> {
+        let mut bytes = jpeg_bytes(&[]);
+        let frame = bytes.windows(2).position(|w| w == [0xFF, 0xC0]).unwrap();
+        change(&mut bytes[frame + 4..]);
+        bytes
+    }
+
+    #[test]
+    fn a_header_bomb_is_refused_by_its_header_alone() {
+        let bomb =
+            with_frame_header(|frame| frame[1..5].copy_from_slice(&[0xFF, 0xDC, 0xFF, 0xDC]));
+        let error = left(&bomb).unwrap_err();
+        assert!(
+            matches!(
+                error,
+                DecodeError::TooLarge {
+                    found_px: (65_500, 65_500),
+                    ..
+                }
+            ),
+            "{error}"
+        );
+        let other = with_frame_header(|frame| frame[2] = 51);
+        assert!(matches!(
+            left(&other),
+            Err(DecodeError::Size {
+                found_px: (72, 51),
+                ..
+            })
+        ));
+    }
+
+    #[test]
+    fn twelve_bits_four_colours_and_turned_pictures_are_refused_by_name() {
+        let refuse = |bytes: &[u8]| left(bytes).unwrap_err().to_string();
+        assert!(refuse(&with_frame_header(|frame| frame[0] = 12)).contains("8 bits"));
+        assert!(refuse(&with_frame_header(|frame| frame[5] = 4)).contains("CMYK"));
+        let mut turned = jpeg_bytes(&[]);
+        let exif: &[u8] = b"\xFF\xE1\x00\x22Exif\0\0MM\0\x2A\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0";
+        turned.splice(2..2, exif.iter().copied());
+        assert!(refuse(&turned).contains("EXIF"));
+    }
+
+    #[test]
+    fn a_png_is_read_exactly_and_refused_when_cut_off_or_deep() {
+        let pixels = picture(72, 50, 3);
+        let png = encode(".png", &pixels, &[]);
+        let decoded = decoder()
+            .left(&encoded(ImageEncoding::Png, png.clone()))
+            .unwrap();
+        assert_eq!(decoded.data_bytes().unwrap(), pixels.data_bytes().unwrap());
+        for length in (0..png.len()).step_by(11) {
+            let cut = encoded(ImageEncoding::Png, png[..length].to_vec());
+            assert!(decoder().left(&cut).is_err(), "{length}");
+        }
+        let mut deep = png;
+        deep[24] = 16;
+        let error = decoder()
+            .left(&encoded(ImageEncoding::Png, deep))
+            .unwrap_err();
+        assert!(error.to_string().contains("16 bits"), "{error}");
+    }
+
+    fn raw_image(encoding: &str, step: u32, bytes: Vec<u8>) -> EncodedImage {
+        let (width, height) = SIZE;
+        encoded(
+            ImageEncoding::Raw {
+                encoding: encoding.to_owned(),
+                width,
+                height,
+                step,
+            },
+            bytes,
+        )
+    }
+
+    #[test]
+    fn raw_rows_are_unpadded_and_colours_ordered() {
+        let pixels = picture(72, 50, 3);
+        let plain = pixels.data_bytes().unwrap();
+        let padded: Vec<u8> = plain
+            .chunks(72 * 3)
+            .flat_map(|row| row.iter().copied().chain([9; 8]))
+            .collect();
+        let bgr = decoder()
+            .left(&raw_image("bgr8", 72 * 3 + 8, padded.clone()))
+            .unwrap();
+        assert_eq!(bgr.data_bytes().unwrap(), plain);
+        let rgb = decoder()
+            .left(&raw_image("rgb8", 72 * 3 + 8, padded))
+            .unwrap();
+        assert_eq!(
+            rgb.data_bytes().unwrap()[..3],
+            [plain[2], plain[1], plain[0]]
+        );
+        let mono = decoder()
+            .left(&raw_image("mono8", 72, vec![5; 72 * 50]))
+            .unwrap();
+        assert_eq!(mono.data_bytes().unwrap()[..3], [5, 5, 5]);
+    }
+
+    #[test]
+    fn raw_images_that_lie_about_their_layout_are_refused() {
+        let refuse = |image: &EncodedImage| decoder().left(image).unwrap_err();
+        let short = refuse(&raw_image("bgr8", 216, vec![0; 216 * 50 - 1]));
+        assert!(matches!(short, DecodeError::RawLayout { .. }), "{short}");
+        let narrow = refuse(&raw_image("bgr8", 72, vec![0; 216 * 50]));
+        assert!(matches!(narrow, DecodeError::RawLayout { .. }), "{narrow}");
+        let wide = refuse(&raw_image("bgr8", u32::MAX, vec![0; 216 * 50]));
+        assert!(matches!(wide, DecodeError::RawLayout { .. }), "{wide}");
+        assert!(
+            refuse(&raw_image("mono16", 144, vec![0; 144 * 50]))
+                .to_string()
+                .contains("mono16")
+        );
+    }
+
+    #[test]
+    fn dead_and_stuck_eyes_are_told_from_live_ones() {
+        let image = |seed: u8| encoded(ImageEncoding::Png, vec![seed]);
+        let flat = |value: f64| {
+            Mat::new_rows_cols_with_default(50, 72, core::CV_8UC1, Scalar::all(value)).unwrap()
+        };
+        let mut watch = EyeWatch::default();
+        assert_eq!(
+            watch.check(&image(0), &picture(72, 50, 1)).unwrap(),
+            EyeHealth::Good
+        );
+        assert!(matches!(
+            watch.check(&image(1), &flat(2.0)).unwrap(),
+            EyeHealth::Black { .. }
+        ));
+        assert!(matches!(
+            watch.check(&image(2), &flat(255.0)).unwrap(),
+            EyeHealth::Saturated { .. }
+        ));
+        assert_eq!(
+            watch.check(&image(3), &flat(128.0)).unwrap(),
+            EyeHealth::Good
+        );
+        for _ in 0..3 {
+            assert_eq!(
+                watch.check(&image(3), &flat(128.0)).unwrap(),
+                EyeHealth::Good
+            );
+        }
+        assert_eq!(
+            watch.check(&image(3), &flat(128.0)).unwrap(),
+            EyeHealth::Frozen { frames: 5 }
+        );
+        assert_eq!(
+            watch.check(&image(4), &flat(128.0)).unwrap(),
+            EyeHealth::Good
+        );
+    }
+}

@@ -343,3 +343,157 @@ fn float_seconds(text: &str) -> Option<i64> {
     let duration = SignedDuration::try_from_secs_f64(value).ok()?;
     i64::try_from(duration.as_nanos()).ok()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ingest::testing::{START_NS, encode, picture};
+
+    fn write(root: &Path, name: &str) {
+        let path = root.join(name);
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        let png = encode(".png", &picture(8, 6, name.len() as u64), &[]);
+        std::fs::write(path, png).unwrap();
+    }
+
+    fn address(root: &Path) -> FolderAddress {
+        FolderAddress {
+            path: root.to_owned(),
+            rate_hz: None,
+            start_utc: None,
+        }
+    }
+
+    fn times_and_eyes(folder: &mut Folder) -> Vec<(i64, bool)> {
+        let pairs = std::iter::from_fn(|| folder.next_pair().unwrap());
+        pairs
+            .map(|pair| (pair.at.unix_ns(), pair.value.right.is_some()))
+            .collect()
+    }
+
+    #[test]
+    fn files_named_by_time_are_paired_within_the_skew() {
+        for (left, right) in TIMED {
+            let root = tempfile::tempdir().unwrap();
+            for ns in [START_NS, START_NS + 100, START_NS + 200_000_000] {
+                write(root.path(), &format!("{left}/{ns}.png"));
+            }
+            write(root.path(), &format!("{right}/{}.png", START_NS + 30));
+            write(
+                root.path(),
+                &format!("{right}/{}.png", START_NS + 205_000_000),
+            );
+            std::fs::write(root.path().join(left).join("data.csv"), "#timestamp").unwrap();
+            let mut folder = Folder::open(&address(root.path()), 0.000_000_050).unwrap();
+            let first = folder.next_pair().unwrap().unwrap();
+            assert_eq!(first.value.skew, SignedDuration::from_nanos(30));
+            let rest = times_and_eyes(&mut folder);
+            assert_eq!(
+                rest,
+                [(START_NS + 100, false), (START_NS + 200_000_000, false)]
+            );
+            let stream = folder.counters().stream;
+            assert_eq!(
+                (stream.pairs, stream.left_alone, stream.right_alone),
+                (1, 2, 1)
+            );
+        }
+    }
+
+    #[test]
+    fn numbered_files_take_their_times_from_the_list_or_the_rate() {
+        let root = tempfile::tempdir().unwrap();
+        for number in 0..3 {
+            write(root.path(), &format!("image_l/{number:06}.png"));
+        }
+        write(root.path(), "image_r/000000.png");
+        write(root.path(), "image_r/000002.png");
+        std::fs::write(root.path().join("times.txt"), "0\n0.1037\n2.07e-01\n").unwrap();
+        let start_utc = Some(ServiceTime::from_unix_ns(START_NS));
+        let listed = FolderAddress {
+            start_utc,
+            ..address(root.path())
+        };
+        let mut folder = Folder::open(&listed, 0.001).unwrap();
+        let expected = [
+            (START_NS, true),
+            (START_NS + 103_700_000, false),
+            (START_NS + 207_000_000, true),
+        ];
+        assert_eq!(times_and_eyes(&mut folder), expected);
+        let steady = FolderAddress {
+            rate_hz: Some(10.0),
+            ..listed
+        };
+        let mut folder = Folder::open(&steady, 0.001).unwrap();
+        let times: Vec<_> = times_and_eyes(&mut folder)
+            .iter()
+            .map(|(ns, _)| ns - START_NS)
+            .collect();
+        assert_eq!(times, [0, 100_000_000, 200_000_000]);
+    }
+
+    #[test]
+    fn whole_nanoseconds_and_decimals_are_read_exactly() {
+        assert_eq!(
+            nanoseconds("1533429604556000001"),
+            Some(1_533_429_604_556_000_001)
+        );
+        assert_eq!(
+            nanoseconds("1533429604.556000001"),
+            Some(1_533_429_604_556_000_001)
+        );
+        assert_eq!(nanoseconds("12"), Some(12_000_000_000));
+        assert_eq!(nanoseconds("1.5e+00"), Some(1_500_000_000));
+        for bad in ["-1", "nan", "inf", "1,5", "", "."] {
+            assert_eq!(nanoseconds(bad), None, "{bad}");
+        }
+    }
+
+    #[test]
+    fn what_fits_no_layout_is_refused_with_what_would() {
+        let refuse = |root: &Path| Folder::open(&address(root), 0.001).unwrap_err().to_string();
+        let empty = tempfile::tempdir().unwrap();
+        assert!(refuse(empty.path()).contains("image_l/ and image_r/"));
+        let named = tempfile::tempdir().unwrap();
+        write(named.path(), "left/frame_1.png");
+        let error = refuse(named.path());
+        assert!(
+            error.contains("frame_1.png") && error.contains("nanoseconds"),
+            "{error}"
+        );
+        let timeless = tempfile::tempdir().unwrap();
+        write(timeless.path(), "image_l/000000.png");
+        assert!(refuse(timeless.path()).contains("times.txt"));
+        std::fs::write(timeless.path().join("times.txt"), "noon\n").unwrap();
+        let error = refuse(timeless.path());
+        assert!(
+            error.contains("line 1") && error.contains("noon"),
+            "{error}"
+        );
+        std::fs::write(timeless.path().join("times.txt"), "1\n2\n").unwrap();
+        assert!(refuse(timeless.path()).contains("2 times for 1 left images"));
+    }
+
+    #[test]
+    fn the_drive_of_kitti_opens_as_it_lies() {
+        let shared = std::env::var_os("EMBERFIX_SHARED").map_or("../shared".into(), PathBuf::from);
+        let path = Path::new(env!("CARGO_MANIFEST_DIR"))
+            .join(shared)
+            .join("data/vehicle/kitti_01");
+        if !path.is_dir() {
+            println!("skipped: no shared data");
+            return;
+        }
+        let address = FolderAddress {
+            path,
+            rate_hz: Some(10.0),
+            start_utc: None,
+        };
+        let mut folder = Folder::open(&address, 0.001).unwrap();
+        let times = times_and_eyes(&mut folder);
+        assert_eq!(times.len(), 51);
+        assert!(times.iter().all(|(_, both)| *both));
+        assert_eq!(times[50].0, 5_000_000_000);
+    }
+}

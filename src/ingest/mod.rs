@@ -29,12 +29,14 @@ mod messages;
 mod pairing;
 pub mod recording;
 pub mod socket;
+#[cfg(test)]
+pub(crate) mod testing;
 mod url;
 
 pub use blocks::RECORD_LIMIT_BYTES;
 pub use camera::CaptureClock;
-pub use decode::{DecodeError, EyeHealth, EyeWatch};
-pub use live::LatestPair;
+pub use decode::{DecodeError, EyeHealth, EyeWatch, ImageDecoder};
+pub use live::{LatestPair, PATIENCE, Taken};
 pub use mcap_stream::{McapStream, StreamEvent};
 pub use messages::{CalibrationMismatch, StatedCalibration};
 pub use pairing::PairAssembler;
@@ -94,7 +96,7 @@ pub struct StereoPair {
 /// A source of pairs.
 pub trait StereoSource: Send {
     /// The next pair; `None` when the source has ended. A live source waits at most
-    /// [`live::PATIENCE`](LatestPair) and then says [`SourceError::NoFrames`].
+    /// [`PATIENCE`] and then says [`SourceError::NoFrames`].
     ///
     /// # Errors
     /// [`SourceError`]; [`SourceError::is_fatal`] says whether to go on.
@@ -186,7 +188,8 @@ pub enum SourceError {
     },
     /// A recording without anything that we could replay.
     #[error(
-        "recording {path}: holds no message of {expected}",
+        "recording {path}: holds no whole message of {expected} ({bad_chunks} damaged chunks, \
+         {lost_bytes} bytes cut off)",
         path = path.display()
     )]
     NothingRecorded {
@@ -194,6 +197,10 @@ pub enum SourceError {
         path: PathBuf,
         /// The topics that were looked for.
         expected: &'static str,
+        /// Chunks that are damaged.
+        bad_chunks: u64,
+        /// Bytes of records that are not whole.
+        lost_bytes: u64,
     },
     /// A live source that gave nothing for a while; it may come back.
     #[error("camera source {source_name}: no frames for {waited_s} s")]

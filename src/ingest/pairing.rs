@@ -202,3 +202,117 @@ impl PairAssembler {
         });
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ingest::ImageEncoding;
+    use crate::ingest::testing::at;
+
+    fn image(ms: i64) -> EncodedImage {
+        EncodedImage {
+            encoding: ImageEncoding::Jpeg,
+            bytes: bytes::Bytes::new(),
+            at: at(ms),
+        }
+    }
+
+    /// Feeds (eye, exposure ms), each arriving 10 ms later; gives (left ms, right ms) of the pairs.
+    fn pairs_of(
+        assembler: &mut PairAssembler,
+        images: &[(Eye, i64)],
+    ) -> (Vec<(i64, Option<i64>)>, StreamCounters) {
+        let mut counters = StreamCounters::default();
+        let mut pairs = Vec::new();
+        for (eye, ms) in images {
+            assembler.push(*eye, image(*ms), at(ms + 10), &mut counters);
+            pairs.extend(std::iter::from_fn(|| assembler.pop()));
+        }
+        let ms = |time: ServiceTime| (time - at(0)).as_millis() as i64;
+        let times = pairs.iter().map(|pair| {
+            (
+                ms(pair.at),
+                pair.value.right.as_ref().map(|right| ms(right.at)),
+            )
+        });
+        (times.collect(), counters)
+    }
+
+    use Eye::{Left as L, Right as R};
+
+    #[test]
+    fn eyes_within_the_skew_make_a_pair_in_either_order() {
+        let mut assembler = PairAssembler::new(0.002);
+        let (pairs, counters) = pairs_of(
+            &mut assembler,
+            &[(L, 0), (R, 2), (R, 99), (L, 100), (L, 200), (R, 200)],
+        );
+        assert_eq!(pairs, [(0, Some(2)), (100, Some(99)), (200, Some(200))]);
+        assert_eq!(
+            (counters.pairs, counters.left_alone, counters.right_alone),
+            (3, 0, 0)
+        );
+    }
+
+    #[test]
+    fn eyes_beyond_the_skew_make_none() {
+        let mut assembler = PairAssembler::new(0.002);
+        let (pairs, counters) = pairs_of(
+            &mut assembler,
+            &[(L, 0), (R, 3), (L, 100), (R, 97), (R, 100)],
+        );
+        assert_eq!(pairs, [(0, None), (100, Some(100))]);
+        assert_eq!((counters.right_alone, counters.backwards), (2, 0));
+    }
+
+    #[test]
+    fn a_dead_right_eye_delays_and_never_stops_the_left_one() {
+        let mut assembler = PairAssembler::new(0.002);
+        let (pairs, _) = pairs_of(&mut assembler, &[(L, 0), (L, 100), (L, 200), (L, 300)]);
+        assert_eq!(pairs, [(0, None), (100, None)]);
+        let mut counters = StreamCounters::default();
+        assembler.end_stream(&mut counters);
+        assert_eq!(counters.left_alone, 2);
+    }
+
+    #[test]
+    fn a_dead_left_eye_keeps_nothing_waiting() {
+        let mut assembler = PairAssembler::new(0.002);
+        let rights: Vec<_> = (0..100).map(|n| (R, n * 100)).collect();
+        let (pairs, counters) = pairs_of(&mut assembler, &rights);
+        assert_eq!((pairs.len(), counters.right_alone), (0, 98));
+    }
+
+    #[test]
+    fn one_lost_right_image_costs_one_pair() {
+        let mut assembler = PairAssembler::new(0.002);
+        let (pairs, _) = pairs_of(
+            &mut assembler,
+            &[(L, 0), (R, 0), (L, 100), (L, 200), (R, 200)],
+        );
+        assert_eq!(pairs, [(0, Some(0)), (100, None), (200, Some(200))]);
+    }
+
+    #[test]
+    fn a_recording_knows_at_once_that_no_right_image_will_come() {
+        let mut assembler = PairAssembler::new(0.002).knowing_rights(vec![at(100)]);
+        let (pairs, _) = pairs_of(&mut assembler, &[(L, 0)]);
+        assert_eq!(pairs, [(0, None)]);
+        let (pairs, _) = pairs_of(&mut assembler, &[(L, 100), (R, 100), (L, 200)]);
+        assert_eq!(pairs, [(100, Some(100)), (200, None)]);
+    }
+
+    #[test]
+    fn timestamps_that_go_backwards_or_ahead_are_counted_and_do_not_poison_the_stream() {
+        let mut assembler = PairAssembler::new(0.002);
+        let mut counters = StreamCounters::default();
+        assembler.push(L, image(100), at(110), &mut counters);
+        assembler.push(L, image(100), at(111), &mut counters);
+        assembler.push(L, image(50), at(112), &mut counters);
+        assembler.push(L, image(1_000_000), at(113), &mut counters);
+        assembler.push(L, image(200), at(210), &mut counters);
+        assembler.push(R, image(200), at(211), &mut counters);
+        assert_eq!((counters.backwards, counters.from_the_future), (2, 1));
+        assert_eq!((counters.left_alone, counters.pairs), (1, 1));
+    }
+}

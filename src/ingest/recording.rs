@@ -16,7 +16,7 @@ use emberfix_calib::{Eye, Rig};
 use emberfix_frames::{ServiceTime, Stamped};
 use std::collections::VecDeque;
 use std::fs::File;
-use std::io::{BufReader, Read, Seek, SeekFrom};
+use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
 /// Unpacked blocks that are kept: writers interleave a few at most.
@@ -93,8 +93,12 @@ impl Recording {
             source,
         };
         let file = File::open(path).map_err(io)?;
-        let mut survey = Survey::new();
-        survey.read(&file).map_err(io)?;
+        let mut survey = Survey::of(&file, Dictionary::default()).map_err(io)?;
+        if survey.counters.undeclared > 0 {
+            // The chunk that declared the channels is damaged; the summary repeats them.
+            let known = survey.reader.into_dictionary();
+            survey = Survey::of(&file, known).map_err(io)?;
+        }
         survey.into_recording(path, file, max_skew_s)
     }
 
@@ -209,22 +213,25 @@ struct Survey {
 }
 
 impl Survey {
-    fn new() -> Self {
-        Self {
-            reader: BlockReader::new(),
+    fn of(mut file: &File, known: Dictionary) -> std::io::Result<Self> {
+        let mut survey = Self {
+            reader: BlockReader::knowing(known),
             counters: StreamCounters::default(),
             blocks: Vec::new(),
             entries: Vec::new(),
             rights: Vec::new(),
             bytes: 0,
-        }
+        };
+        file.rewind()?;
+        survey.read(file)?;
+        survey.reader.finish(&mut survey.counters);
+        Ok(survey)
     }
 
-    fn read(&mut self, file: &File) -> std::io::Result<()> {
-        let mut input = BufReader::new(file);
+    fn read(&mut self, mut file: &File) -> std::io::Result<()> {
         let mut buffer = vec![0; READ_BYTES];
         loop {
-            let count = input.read(&mut buffer)?;
+            let count = file.read(&mut buffer)?;
             if count == 0 {
                 return Ok(());
             }
@@ -265,18 +272,19 @@ impl Survey {
         file: File,
         max_skew_s: f64,
     ) -> Result<Recording, SourceError> {
-        if !self.reader.has_begun() {
+        if self.counters.garbage_bytes == self.bytes {
             return Err(SourceError::NotMcap {
                 path: path.to_owned(),
                 bytes: self.bytes,
             });
         }
-        self.reader.finish(&mut self.counters);
         let is_input = |entry: &Entry| matches!(entry.role, Role::Image(_) | Role::Mavlink);
         if !self.entries.iter().any(is_input) {
             return Err(SourceError::NothingRecorded {
                 path: path.to_owned(),
                 expected: INPUT_TOPICS,
+                lost_bytes: self.counters.lost_bytes,
+                bad_chunks: self.counters.bad_chunks,
             });
         }
         if self.counters.lost_bytes > 0 || self.counters.bad_chunks > 0 {

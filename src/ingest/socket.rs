@@ -228,3 +228,132 @@ fn is_pause(kind: ErrorKind) -> bool {
         ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted
     )
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ingest::testing::{at, pair, rig};
+    use crate::record::{RecordOptions, Tape};
+    use std::io::Write;
+    use std::sync::Arc;
+
+    fn clock() -> ServiceClock {
+        Arc::new(|| at(60_000))
+    }
+
+    /// A recording of so many pairs, as its bytes.
+    fn recording(first: i64, pairs: i64) -> Vec<u8> {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.mcap");
+        let mut tape = Tape::create(&path, &rig(), &RecordOptions::default()).unwrap();
+        for n in first..first + pairs {
+            tape.write_pair(&pair(n)).unwrap();
+        }
+        tape.finish().unwrap();
+        std::fs::read(path).unwrap()
+    }
+
+    /// Waits until the source has taken so many pairs in.
+    fn wait_for(source: &dyn StereoSource, pairs: u64) {
+        let begin = Instant::now();
+        while source.counters().stream.pairs < pairs {
+            assert!(
+                begin.elapsed() < Duration::from_secs(20),
+                "{:?}",
+                source.counters()
+            );
+            std::thread::sleep(Duration::from_millis(5));
+        }
+    }
+
+    fn take(source: &mut dyn StereoSource) -> i64 {
+        let pair = source.next_pair().unwrap().unwrap();
+        assert_eq!(pair.value.arrived, at(60_000), "arrival is by our clock");
+        (pair.at - at(0)).as_millis() as i64
+    }
+
+    #[test]
+    fn the_newest_pair_is_kept_and_the_next_stream_is_awaited() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("camera.sock");
+        let address = SocketAddress::UnixListen(path.clone());
+        let mut source = open(&address, &rig(), clock()).unwrap();
+        UnixStream::connect(&path)
+            .unwrap()
+            .write_all(&recording(0, 5))
+            .unwrap();
+        wait_for(&*source, 5);
+        assert_eq!(take(&mut *source), 400);
+        // The second camera breaks off within its stream and starts at an earlier time.
+        let torn = recording(0, 3);
+        UnixStream::connect(&path)
+            .unwrap()
+            .write_all(&torn[..torn.len() - 100])
+            .unwrap();
+        wait_for(&*source, 8);
+        assert_eq!(take(&mut *source), 200);
+        let counters = source.counters();
+        assert_eq!(
+            (counters.shed, counters.delivered, counters.openings),
+            (6, 2, 2)
+        );
+        assert_eq!(
+            (
+                counters.calibration_mismatches,
+                counters.stream.calibrations
+            ),
+            (0, 4)
+        );
+        drop(source);
+        assert!(!path.exists(), "the socket file goes with its source");
+    }
+
+    #[test]
+    fn we_connect_as_soon_as_a_camera_listens_and_again_when_it_comes_back() {
+        let probe = TcpListener::bind("127.0.0.1:0").unwrap();
+        let port = probe.local_addr().unwrap();
+        drop(probe);
+        let address = SocketAddress::TcpConnect(port.to_string());
+        let mut source = open(&address, &rig(), clock()).unwrap();
+        let listener = TcpListener::bind(port).unwrap();
+        for round in 0..2 {
+            let (mut connection, _) = listener.accept().unwrap();
+            connection.write_all(&recording(3 * round, 3)).unwrap();
+            drop(connection);
+            wait_for(&*source, 3 * (round as u64 + 1));
+            assert_eq!(take(&mut *source), 300 * round + 200);
+        }
+    }
+
+    #[test]
+    fn a_camera_that_sends_garbage_or_nothing_is_reported_and_survived() {
+        let address = SocketAddress::TcpListen("127.0.0.1:0".to_owned());
+        assert!(open(&address, &rig(), clock()).is_ok());
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("camera.sock");
+        let mut source = open(&SocketAddress::UnixListen(path.clone()), &rig(), clock()).unwrap();
+        UnixStream::connect(&path)
+            .unwrap()
+            .write_all(&[0x5A; 100_000])
+            .unwrap();
+        let error = source.next_pair().unwrap_err();
+        assert!(matches!(error, SourceError::NoFrames { .. }) && !error.is_fatal());
+        assert_eq!(source.counters().stream.garbage_bytes, 100_000);
+        UnixStream::connect(&path)
+            .unwrap()
+            .write_all(&recording(0, 1))
+            .unwrap();
+        assert_eq!(take(&mut *source), 0);
+    }
+
+    #[test]
+    fn an_address_that_is_taken_is_refused_at_once() {
+        let taken = TcpListener::bind("127.0.0.1:0").unwrap();
+        let address = SocketAddress::TcpListen(taken.local_addr().unwrap().to_string());
+        let error = open(&address, &rig(), clock()).map(drop).unwrap_err();
+        assert!(
+            error.is_fatal() && error.to_string().contains("tcp-listen:127.0.0.1"),
+            "{error}"
+        );
+    }
+}

@@ -220,3 +220,95 @@ pub fn open(
         CameraUrl::Recording(path) => Ok(Box::new(Recording::open(path, rig)?)),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_form_is_read() {
+        let read = |url: &str| url.parse::<CameraUrl>().unwrap();
+        let socket = |address| CameraUrl::Socket(address);
+        assert_eq!(
+            read("tcp-listen:[::1]:5600"),
+            socket(SocketAddress::TcpListen("[::1]:5600".to_owned()))
+        );
+        assert_eq!(
+            read("tcp-connect:camera.local:5600"),
+            socket(SocketAddress::TcpConnect("camera.local:5600".to_owned()))
+        );
+        assert_eq!(
+            read("unix-listen:/run/a"),
+            socket(SocketAddress::UnixListen("/run/a".into()))
+        );
+        assert_eq!(
+            read("unix-connect:a"),
+            socket(SocketAddress::UnixConnect("a".into()))
+        );
+        assert_eq!(
+            read("recording:a.mcap"),
+            CameraUrl::Recording("a.mcap".into())
+        );
+        let CameraUrl::Capture(v4l2) =
+            read("v4l2:/dev/video0?layout=side-by-side&width=2560&fps=30")
+        else {
+            unreachable!()
+        };
+        assert_eq!(v4l2.device, CaptureDevice::V4l2("/dev/video0".to_owned()));
+        assert_eq!(
+            (v4l2.format.width, v4l2.format.fps),
+            (Some(2560), Some(30.0))
+        );
+        let CameraUrl::Capture(two) = read("v4l2:/dev/video0,/dev/video2") else {
+            unreachable!()
+        };
+        assert!(
+            matches!(two.device, CaptureDevice::TwoV4l2 { right, .. } if right == "/dev/video2")
+        );
+        let pipeline = "v4l2src device=/dev/video0 ! video/x-raw,width=2560 ! appsink";
+        let CameraUrl::Capture(gst) = read(&format!("gstreamer:{pipeline}")) else {
+            unreachable!()
+        };
+        assert_eq!(gst.device, CaptureDevice::Gstreamer(pipeline.to_owned()));
+        let CameraUrl::Folder(folder) =
+            read("folder:a/b?rate_hz=10&start_utc=2026-03-01T12:00:00Z")
+        else {
+            unreachable!()
+        };
+        assert_eq!(
+            (folder.path, folder.rate_hz),
+            (PathBuf::from("a/b"), Some(10.0))
+        );
+        assert_eq!(
+            folder.start_utc,
+            ServiceTime::from_rfc3339("2026-03-01T12:00:00Z")
+        );
+    }
+
+    #[test]
+    fn anything_else_is_refused_with_all_forms_named() {
+        for url in [
+            "",
+            "folder:",
+            "rtsp://camera",
+            "tcp-listen:5600",
+            "tcp-listen:a:99999",
+            "v4l2:a,b,c",
+        ] {
+            let error = url.parse::<CameraUrl>().unwrap_err().to_string();
+            assert!(
+                error.contains("unix-listen:PATH") && error.contains("recording:"),
+                "{error}"
+            );
+        }
+    }
+
+    #[test]
+    fn a_bad_option_is_named_with_what_it_may_be() {
+        let refuse = |url: &str| url.parse::<CameraUrl>().unwrap_err().to_string();
+        assert!(refuse("folder:a?rate_hz=0").contains("rate_hz=0"));
+        assert!(refuse("folder:a?rate=10").contains("rate_hz, start_utc"));
+        assert!(refuse("v4l2:/dev/video0?layout=top-bottom").contains("side-by-side"));
+        assert!(refuse("folder:a?start_utc=yesterday").contains("RFC 3339"));
+    }
+}

@@ -136,10 +136,10 @@ impl<'a> View<'a> {
         &self.up
     }
 
-    /// A point of the mission plane on the Earth.
+    /// A point of the mission plane on the Earth; `None` when it is nowhere near its surface.
     #[must_use]
-    pub fn ecef(&self, point: &Coordinate<MissionEnu>) -> Coordinate<Ecef> {
-        self.mission_from_ecef.inverse_transform(*point)
+    pub fn place(&self, point: &Coordinate<MissionEnu>) -> Option<Wgs84> {
+        emberfix_frames::place_from_ecef(&self.mission_from_ecef.inverse_transform(*point))
     }
 
     /// Unit vector of a pixel's ray in the mission plane.

@@ -17,7 +17,7 @@ pub use terrain::{ConstantPlane, Terrain, TerrainHit, meet_terrain};
 use crate::alarm::Method;
 use emberfix_calib::RectifiedPixel;
 use emberfix_frames::{
-    Coordinate, Covariance, Ecef, Metres, MissionEnu, ServiceTime, Wgs84,
+    Coordinate, Covariance, Metres, MissionEnu, ServiceTime, Wgs84,
 };
 
 /// One detection, in the pixels of the rectified left image.
@@ -51,8 +51,8 @@ pub struct DisparityOf {
 /// One position from one sighting.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Fix {
-    /// Base of the fire.
-    pub position: Coordinate<Ecef>,
+    /// Base of the fire: latitude, longitude, ellipsoid height.
+    pub place: Wgs84,
     /// The same in the plane at the mission datum.
     pub enu: Coordinate<MissionEnu>,
     /// All of its error: range, bearing, attitude, GNSS, calibration, time, terrain.
@@ -61,14 +61,6 @@ pub struct Fix {
     pub methods: Vec<Method>,
     /// Straight line from the left camera, metres.
     pub range_m: f64,
-}
-
-impl Fix {
-    /// Latitude, longitude, ellipsoid height.
-    #[must_use]
-    pub fn place(&self) -> Wgs84 {
-        self.position.to_wgs84()
-    }
 }
 
 /// Furthest depth at which a fix is believed, metres: beyond it a pixel is metres wide.
@@ -98,8 +90,8 @@ pub fn fix(sighting: &Sighting, view: &View<'_>, terrain: Option<&dyn Terrain>) 
     let covariance = along + view.across_covariance(&ray, range_m, sighting.base_sigma_px)
         + view.shared_covariance(&point);
     let enu = Coordinate::from_metres(point);
-    let position = view.ecef(&enu);
-    Some(Fix { position, enu, covariance, methods, range_m })
+    let place = view.place(&enu)?;
+    Some(Fix { place, enu, covariance, methods, range_m })
 }
 
 /// Slant range along the base's ray and its sigma, from disparity: the flame's upright axis is

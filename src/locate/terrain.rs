@@ -67,7 +67,7 @@ pub fn meet_terrain(
 ) -> TerrainHit {
     let above = |range: f64| {
         let point = Coordinate::from_metres(camera + ray * range);
-        let place = view.ecef(&point).to_wgs84();
+        let place = view.place(&point)?;
         let ground = terrain.height_at(&place)?;
         Some((place.height().m() - ground.m(), terrain.sigma_m(&place)))
     };

@@ -2,7 +2,7 @@ use super::*;
 use crate::pose::Pose;
 use crate::testing::{datum, pose, rig};
 use emberfix_calib::{RectifiedPixel, Rig};
-use emberfix_frames::{Attitude, EllipsoidHeight, Matrix3, Vector3, Wgs84Parts, enu_offset};
+use emberfix_frames::{Attitude, Ecef, EllipsoidHeight, Matrix3, Vector3, Wgs84Parts, enu_offset};
 use std::f64::consts::FRAC_PI_2;
 
 const SIGMAS: SharedSigmas = SharedSigmas { heading_rad: 0.03, tilt_rad: 0.005 };
@@ -36,7 +36,10 @@ fn the_chain_to_longitude_and_latitude_mends_the_printed_forms() {
     let (rig, pose) = (rig(30.0), pose(0.0, 0.0, 0.0));
     let view = View::new(&rig, &pose, &SIGMAS, &datum());
     let point = point_on_axis(&pose, &rig, 10.0);
-    let ecef = view.ecef(&Coordinate::from_metres(point)).metres();
+    let ecef = Coordinate::<Ecef>::from_wgs84(
+        &view.place(&Coordinate::from_metres(point)).unwrap(),
+    )
+    .metres();
     let (lat, lon) = (datum().latitude_deg().to_radians(), datum().longitude_deg().to_radians());
     let (sp, cp, sl, cl) = (lat.sin(), lat.cos(), lon.sin(), lon.cos());
     #[rustfmt::skip]
@@ -49,7 +52,7 @@ fn the_chain_to_longitude_and_latitude_mends_the_printed_forms() {
     assert!((ecef - (vehicle + printed_rotation * point)).norm() < 1e-6);
     assert!((ecef - printed_rotation * point).norm() > 6e6, "rotation alone is no position");
 
-    let place = view.ecef(&Coordinate::from_metres(point)).to_wgs84();
+    let place = view.place(&Coordinate::from_metres(point)).unwrap();
     let printed_longitude = (ecef.y / ecef.x).atan().to_degrees();
     assert!((printed_longitude + 60.888).abs() < 0.001, "{printed_longitude}");
     assert!((place.longitude_deg() - 119.112_016_7).abs() < 1e-9);

@@ -26,7 +26,7 @@ pub fn sighting(
         return json!({"type": "Feature", "geometry": null, "properties": properties});
     };
     let size = crate::assess::size(&classified.sighting, view, &fix.enu.metres());
-    let place = fix.place();
+    let place = fix.place;
     let more = json!({
         "altitude_msl_m": situation.altitude.m(),
         "height_above_ground_m": situation.above_ground.map(HeightAboveGround::m),

@@ -26,9 +26,11 @@ use crate::range::Ranger;
 use crate::track::{Fire, Outcome, Tracker};
 use emberfix_calib::Rig;
 use emberfix_frames::{
-    ServiceTime, SignedDuration, Stamped, TimeSyncSample, Wgs84, Wgs84Parts, ecef_from_enu, seconds,
+    ServiceTime, SignedDuration, Stamped, TimeSyncSample, Wgs84, Wgs84Parts, ecef_from_enu, place_from_ecef,
+    seconds,
 };
-use emberfix_mav::{Address, GpsRaw, Received, SystemId, Telemetry, TimeSyncMessage};
+use emberfix_mav::telemetry::{GpsRaw, TimeSyncMessage};
+use emberfix_mav::{Address, Received, SystemId, Telemetry};
 use std::sync::Arc;
 
 /// One thing that reached the service.
@@ -319,7 +321,7 @@ impl Pipeline {
         let (found, classified) = &seen.sightings[outcome.index];
         let at = classified.sighting.at;
         let situation = outcome.fix.as_ref().map(|fix| {
-            let mut situation = situate(&fix.place(), &mut self.poses, self.terrain.as_deref());
+            let mut situation = situate(&fix.place, &mut self.poses, self.terrain.as_deref());
             situation.degraded = self.degraded.iter().map(|reason| (*reason).to_owned()).collect();
             situation
         });
@@ -332,11 +334,11 @@ impl Pipeline {
         let (datum, terrain) = (self.datum, self.terrain.clone());
         let (poses, degraded) = (&mut self.poses, &self.degraded);
         let due = self.desk.due(self.tracker.fires(), |fire| {
-            let place = ecef_from_enu(&datum).transform(fire.position()).to_wgs84();
+            let place = place_from_ecef(&ecef_from_enu(&datum).transform(fire.position()))?;
             let mut situation = situate(&place, poses, terrain.as_deref());
             situation.degraded = degraded.iter().map(|reason| (*reason).to_owned()).collect();
             situation.degraded.extend(fire.merged_into.map(|into| format!("merged_into_{}", into.0)));
-            situation
+            Some(situation)
         });
         due.into_iter().map(|alarm| Output::Alarm(Box::new(alarm))).collect()
     }

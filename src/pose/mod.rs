@@ -353,7 +353,7 @@ impl PoseEstimator {
             }
         };
         let point = Coordinate::<VehicleEnu>::from_metres(offset);
-        Some(ecef_from_enu(&first).transform(point).to_wgs84())
+        emberfix_frames::place_from_ecef(&ecef_from_enu(&first).transform(point))
     }
 
     fn sample_place(&mut self, sample: &PositionSample) -> Option<Wgs84> {

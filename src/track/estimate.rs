@@ -75,7 +75,7 @@ impl Estimate {
         let position = along * along.transpose()
             + across.m2()
             + by_shared * by_shared.transpose();
-        let terrain_sigma = terrain.map_or(0.0, |t| t.sigma_m(&fix.place()));
+        let terrain_sigma = terrain.map_or(0.0, |t| t.sigma_m(&fix.place));
         let mut covariance = SMatrix::<f64, STATES, STATES>::zeros();
         covariance.fixed_view_mut::<3, 3>(0, 0).copy_from(&position);
         covariance[(TERRAIN, TERRAIN)] = terrain_sigma * terrain_sigma;
@@ -323,7 +323,7 @@ fn scaled<const M: usize>(
 
 /// Height of the terrain model beneath a point, in the mission plane.
 fn ground_up(point: &Vector3<f64>, view: &View<'_>, terrain: &dyn Terrain) -> Option<f64> {
-    let place = view.ecef(&Coordinate::<MissionEnu>::from_metres(*point)).to_wgs84();
+    let place = view.place(&Coordinate::<MissionEnu>::from_metres(*point))?;
     let ground = terrain.height_at(&place)?;
     Some(point.z + ground.m() - place.height().m())
 }

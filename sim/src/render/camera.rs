@@ -67,6 +67,11 @@ impl StereoCamera {
         (lens.width as u32, lens.height as u32)
     }
 
+    /// Takes left-camera components to body (forward, right, down).
+    pub(crate) fn body_from_left(&self) -> &Matrix3<f64> {
+        &self.body_from_left
+    }
+
     pub(crate) fn lens(&self, eye: Eye) -> &Lens {
         match eye {
             Eye::Left => &self.left,

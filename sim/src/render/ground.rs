@@ -15,6 +15,9 @@ pub(super) const BLOCK: usize = 8;
 /// No ground is drawn beyond, metres of depth.
 const FARTHEST_M: f64 = 20_000.0;
 
+/// Footprint that textures are cut to, against a pixel's: a lens as sharp as its sensor.
+const SHARPNESS: f32 = 0.75;
+
 /// What is known at a block's corner.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Node {
@@ -277,7 +280,7 @@ impl<'a> Ground<'a> {
         let longest = across.0.hypot(across.1).max(down.0.hypot(down.1)).max(1e-6);
         // Between the short and the long side of a pixel's footprint: neither blur nor alias wins.
         let footprint = (area.sqrt().max(longest / 4.0)) / BLOCK as f32;
-        self.levels_for(footprint)
+        self.levels_for(SHARPNESS * footprint)
     }
 
     fn levels_for(&self, footprint_m: f32) -> Levels<'a> {

@@ -15,6 +15,8 @@ const FARTHEST_M: f64 = 900.0;
 struct SeenBall {
     extent: PixelBox,
     centre: Vector3<f32>,
+    /// Which leaves: no two balls wear the same.
+    phase: f32,
     ball: Ball,
 }
 
@@ -73,8 +75,8 @@ impl Solids {
                 return;
             }
             let normal = enu_from_camera * ((ray * depth - seen.centre) / radius);
-            let skin = normal * radius;
-            let leaf = leaves.at(skin.x + 0.6 * skin.z, skin.y - 0.7 * skin.z)[1] * UNIT;
+            let (across, up) = wrapped(&(normal * radius), &normal);
+            let leaf = leaves.at(across + 7.0 * seen.phase, up)[1] * UNIT;
             // Ragged: towards the rim only the leaves that stick out are there.
             let rim = discriminant / (length2 * radius * radius);
             if rim < 0.45 && leaf < 1.25 - 1.2 * rim {
@@ -124,6 +126,18 @@ impl Solids {
     }
 }
 
+/// Two coordinates of a place on a ball's skin, along the plane that it faces most.
+fn wrapped(skin: &Vector3<f32>, normal: &Vector3<f32>) -> (f32, f32) {
+    let [x, y, z] = [normal.x.abs(), normal.y.abs(), normal.z.abs()];
+    if z > x && z > y {
+        (skin.x, skin.y)
+    } else if x > y {
+        (skin.y + 1.1, skin.z)
+    } else {
+        (skin.x + 2.3, skin.z)
+    }
+}
+
 /// Rows of tiles, lighter at the lower edge; they fade where they are finer than pixels.
 fn rows_gain(rows: f32, across: f32, wide_m: f32, footprint_m: f32) -> f32 {
     if rows == 0.0 {
@@ -144,7 +158,7 @@ fn see_ball(pose: &EyePose, lens: &Lens, ball: &Ball) -> Option<SeenBall> {
     // Off the axis a ball's image is stretched outwards.
     let reach = lens.focal_px.0 * ball.radius_m / (centre.z - ball.radius_m) * (1.0 + tangent2) + 2.0;
     let extent = PixelBox::around(middle, (reach, reach), lens)?;
-    Some(SeenBall { extent, centre: centre.cast(), ball: *ball })
+    Some(SeenBall { extent, centre: centre.cast(), phase: ball.centre_m.x.fract() as f32, ball: *ball })
 }
 
 fn see_quad(pose: &EyePose, lens: &Lens, quad: &Quad) -> Option<SeenQuad> {

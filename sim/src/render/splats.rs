@@ -79,7 +79,8 @@ impl SeenSplat {
             return kernel;
         }
         let torn = billows.at(self.billow.0 + 0.22 * across, self.billow.1 - 0.22 * along)[1] * UNIT;
-        kernel * torn * torn
+        // Soot shines in filaments with gaps between them.
+        kernel * torn * torn * torn.min(1.4)
     }
 
     /// Share of the light behind that it holds back at a cover.

@@ -66,6 +66,11 @@ impl Flame {
         (1.0 + 0.16 * sum).clamp(0.55, 1.5)
     }
 
+    /// Brightness of this fire against a bright one: fuel and soot differ.
+    pub(crate) fn temper(&self) -> f64 {
+        0.42 + 0.58 * unit(self.seed, 0, 910)
+    }
+
     /// Everything that shines and stands on the base.
     pub(crate) fn splats(&self) -> Vec<Splat> {
         let mut splats = self.bed();
@@ -82,7 +87,7 @@ impl Flame {
 
     /// A glowing bed: low splats that never leave the ground.
     fn bed(&self) -> Vec<Splat> {
-        let glow = self.flicker();
+        let glow = self.flicker() * self.temper();
         (0..12)
             .map(|k| {
                 let (x, y) = self.bed_place(k, 500);
@@ -127,7 +132,7 @@ impl Flame {
             spread * y + sway.y + lean.y,
             height.max(0.6 * half_height),
         );
-        let heat = self.flicker() * (1.15 - 0.75 * s) * (0.75 + 0.35 * torn);
+        let heat = self.flicker() * self.temper() * (1.15 - 0.75 * s) * (0.75 + 0.35 * torn);
         Some(Splat {
             kind: SplatKind::Flame,
             centre_m: self.base_m + centre,
@@ -179,8 +184,8 @@ impl Flame {
 const STEPS: u32 = 11;
 /// The camera sees these through a red filter that saturates first: overlapping splats go from red
 /// over orange and yellow to white, as flames do.
-const HOT: [f32; 3] = [2.6, 1.05, 0.22];
-const COOL: [f32; 3] = [1.5, 0.36, 0.035];
+const HOT: [f32; 3] = [2.3, 0.92, 0.20];
+const COOL: [f32; 3] = [1.25, 0.27, 0.03];
 
 fn scaled(colour: [f32; 3], factor: f64) -> [f32; 3] {
     colour.map(|c| c * factor as f32)

@@ -205,7 +205,7 @@ impl World {
             .map(|flame| Glow {
                 centre_m: flame.base_m.xy(),
                 radius_m: 0.6 * flame.width_m + 0.4 * flame.height_m,
-                strength: (0.9 * flame.flicker()) as f32,
+                strength: (0.16 * flame.flicker() * flame.temper()) as f32,
             })
             .collect()
     }
@@ -288,8 +288,10 @@ impl World {
     /// What burns stands on burnt ground.
     fn scorch(&mut self) {
         for (fire, truth) in self.fires.iter().enumerate() {
-            if truth.class == BurningClass::Fire {
-                let radius_m = truth.width_m * (0.5 + 0.5 * unit(self.seed, fire as u32, 0x5C));
+            // Some stand on stone or in a tray: burnt ground must not be what gives a fire away.
+            let burns_ground = unit(self.seed, fire as u32, 0x5D) < 0.6;
+            if truth.class == BurningClass::Fire && burns_ground {
+                let radius_m = truth.width_m * (0.4 + 0.8 * unit(self.seed, fire as u32, 0x5C));
                 let centre_m = truth.base_m.xy();
                 self.things.marks.push(Mark { kind: MarkKind::Scorch, centre_m, radius_m });
             }

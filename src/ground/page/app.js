@@ -59,17 +59,12 @@ const METHOD = { stereo: "stereo", parallax: "views from several places", terrai
 // Reasons that aircraft give, in plain words; one that is not here is shown as it came.
 const DOUBT = {
   mavlink_summary: "Came over the radio as a summary: the ring is a circle and details are missing.",
-  no_stereo: "One camera eye gave nothing: range is less sure.",
-  mono: "One camera eye gave nothing: range is less sure.",
-  gnss_unknown: "The aircraft’s GNSS does not state its accuracy.",
-  gnss_degraded: "The aircraft’s GNSS is weak.",
-  time_not_converged: "Clocks aboard were not yet in step.",
-  timesync: "Clocks aboard were not yet in step.",
-  heading_unknown: "The aircraft’s heading is uncertain.",
-  attitude_stale: "The aircraft’s attitude came late.",
-  telemetry_slow: "The autopilot’s messages came too seldom.",
-  geoid_model: "Height comes from a geoid model, not from the receiver.",
-  no_terrain: "No terrain model: height above ground is unknown.",
+  mono: "One camera eye gave nothing: the range is less sure.",
+  clock_not_synced: "Camera and autopilot clocks are not yet in step.",
+  gnss_accuracy_unknown: "The GNSS receiver does not state its accuracy; the usual one is assumed.",
+  geoid_applied: "The height comes from a geoid model, not from the receiver.",
+  attitude_slow: "The autopilot’s attitude came too seldom.",
+  position_slow: "The autopilot’s position came too seldom.",
 };
 
 function age(ms) {
@@ -327,6 +322,7 @@ function heights(feature) {
 }
 
 function basis(p) {
+  if (isSummary(p)) return `not told over the radio; last seen from ${metres(p.range_m)}`;
   const methods = p.methods.map((m) => METHOD[m] ?? m).join(", ") || "not stated";
   return `${methods}; ${p.sightings} sighting${p.sightings === 1 ? "" : "s"}, last from ${metres(p.range_m)}`;
 }
@@ -356,7 +352,9 @@ function entry(feature) {
     ["Based on", basis(p)],
   ]));
   if (p.degraded.length) {
-    const plain = (reason) => DOUBT[reason] ?? reason.replaceAll("_", " ");
+    const same = (reason) => reason.match(/^merged_into_(\d+)$/)?.[1];
+    const plain = (reason) => DOUBT[reason]
+      ?? (same(reason) ? `Turned out to be the same fire as ${p.uav}-${same(reason)}.` : reason.replaceAll("_", " "));
     item.append(html("ul", { class: "doubt", "aria-label": "Why the ring is wider" }, ...p.degraded.map((r) => html("li", {}, plain(r)))));
   }
   return item;
@@ -480,6 +478,10 @@ function connect() {
   on("time", (time) => setClock(time.now));
   on("alarm", (feature, event) => { lastId = event.lastEventId; takeAlarm(feature); });
   on("track", takePosition);
+  on("refused", ({ at, link, reason }) => {
+    $("refused-text").textContent = `${new Date(at).toLocaleTimeString("en-GB")}: a report over ${link} was not taken. ${reason}`;
+    $("refused").hidden = false;
+  });
   stream.onerror = () => {
     lose();
     // The browser itself tries again after a broken line, but not after a refusal.
@@ -564,6 +566,7 @@ function point([px, py]) {
 }
 
 function fit() { view.following = true; draw(); }
+$("refused-seen").addEventListener("click", () => { $("refused").hidden = true; });
 $("fit").addEventListener("click", fit);
 $("zoom-in").addEventListener("click", () => zoom(1.5));
 $("zoom-out").addEventListener("click", () => zoom(1 / 1.5));
