@@ -22,4 +22,9 @@ pub mod pipeline;
 pub mod pose;
 pub mod range;
 pub mod record;
+pub mod replay;
+pub mod service;
 pub mod track;
+
+#[cfg(test)]
+mod testing;

@@ -1,1 +1,7 @@
-fn main(){}
+//! The `emberfix` program: parse arguments, wire, exit.
+
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    emberfix::cli::main()
+}

@@ -1,1 +1,429 @@
-//! m
+//! The mission file: which rig, model, terrain, thresholds and links a flight uses.
+//!
+//! Raw TOML to a checked [`Mission`], every problem at once. Relative paths are relative to the
+//! mission file. The `[sim]` table belongs to the simulator and is not read here.
+
+use crate::detect::{DetectorConfig, Family};
+use crate::locate::{ConstantPlane, SharedSigmas, Terrain};
+use crate::pose::PoseConfig;
+use crate::range::SgbmConfig;
+use crate::track::TrackConfig;
+use emberfix_calib::{Checks, KeyProblem, Rig, RigError, unknown_keys};
+use emberfix_frames::{EllipsoidHeight, Wgs84, place_from_degrees};
+use serde::Deserialize;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// Why a mission file was refused.
+#[derive(Debug, thiserror::Error)]
+pub enum MissionError {
+    /// The file can't be read.
+    #[error("mission {path}: {source}; examples are missions/gaochun.toml, missions/orbit.toml",
+        path = path.display())]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// Not TOML, or a value of the wrong type.
+    #[error("mission {path}: {message}", path = path.display())]
+    Syntax {
+        /// The file.
+        path: PathBuf,
+        /// What the TOML reader said.
+        message: String,
+    },
+    /// Values that no mission has, and keys that nothing reads.
+    #[error("mission {path}: {}", problems.join("; "), path = path.display())]
+    Values {
+        /// The file.
+        path: PathBuf,
+        /// One sentence per problem: key, value, allowed range, nearest known key.
+        problems: Vec<String>,
+    },
+    /// The rig that it names was refused.
+    #[error("mission {path}: {source}", path = path.display())]
+    Rig {
+        /// The mission file.
+        path: PathBuf,
+        /// Why.
+        source: RigError,
+    },
+}
+
+/// A checked mission.
+#[derive(Clone)]
+pub struct Mission {
+    /// Name, for reports.
+    pub name: String,
+    /// Name of the aircraft, as alarms carry it.
+    pub uav: String,
+    /// The stereo rig.
+    pub rig: Arc<Rig>,
+    /// Origin of the mission's tangent plane.
+    pub datum: Wgs84,
+    /// MAVLink system of the vehicle; 0 takes the first autopilot that is heard.
+    pub system_id: u8,
+    /// Where MAVLink comes from.
+    pub mavlink_url: String,
+    /// Where stereo pairs come from.
+    pub camera_url: String,
+    /// The detector.
+    pub detector: DetectorConfig,
+    /// Stereo matching.
+    pub range: SgbmConfig,
+    /// The ground, if the mission knows it.
+    pub terrain: Option<Arc<dyn Terrain>>,
+    /// Defaults and limits of the pose.
+    pub pose: PoseConfig,
+    /// Errors that stay the same from frame to frame.
+    pub shared: SharedSigmas,
+    /// The tracker.
+    pub track: TrackConfig,
+    /// The ground agent.
+    pub ground: GroundLinks,
+    /// Where the outbox lies.
+    pub state_dir: PathBuf,
+}
+
+/// How alarms reach the ground.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct GroundLinks {
+    /// HTTP address of the ground station, if there is an IP path.
+    pub url: Option<String>,
+    /// MAVLink address (system, component) of our ground agent.
+    pub agent: (u8, u8),
+}
+
+#[derive(Deserialize)]
+struct RawMission {
+    name: String,
+    uav: String,
+    rig: PathBuf,
+    datum: RawPlace,
+    #[serde(default)]
+    vehicle: RawVehicle,
+    mavlink: RawUrl,
+    camera: RawUrl,
+    model: RawModel,
+    #[serde(default)]
+    range: RawRange,
+    terrain: Option<RawTerrain>,
+    #[serde(default)]
+    sigma: RawSigma,
+    #[serde(default)]
+    track: RawTrack,
+    #[serde(default)]
+    ground: RawGround,
+    #[serde(default)]
+    state: RawState,
+}
+
+#[derive(Deserialize)]
+struct RawPlace {
+    latitude_deg: f64,
+    longitude_deg: f64,
+    height_ellipsoid_m: f64,
+}
+
+#[derive(Deserialize, Default)]
+struct RawVehicle {
+    #[serde(default)]
+    system_id: u8,
+}
+
+#[derive(Deserialize)]
+struct RawUrl {
+    url: String,
+}
+
+#[derive(Deserialize)]
+struct RawModel {
+    path: PathBuf,
+    sha256: Option<String>,
+    family: Option<Family>,
+    threshold: Option<f64>,
+    #[serde(default)]
+    whole_frame_only: bool,
+    tile_px: Option<u32>,
+    overlap_px: Option<u32>,
+    threads: Option<u32>,
+}
+
+#[derive(Deserialize, Default)]
+struct RawRange {
+    max_disparity_px: Option<u32>,
+    max_sigma_over_range: Option<f64>,
+}
+
+#[derive(Deserialize)]
+struct RawTerrain {
+    kind: String,
+    height_ellipsoid_m: f64,
+    sigma_m: f64,
+}
+
+#[derive(Deserialize)]
+#[serde(default)]
+struct RawSigma {
+    gnss_horizontal_m: f64,
+    gnss_vertical_m: f64,
+    gnss_floor_m: f64,
+    heading_deg: f64,
+    tilt_deg: f64,
+    gnss_correlation_s: f64,
+    heading_correlation_s: f64,
+}
+
+impl Default for RawSigma {
+    fn default() -> Self {
+        let (pose, track) = (PoseConfig::default(), TrackConfig::default());
+        Self {
+            gnss_horizontal_m: pose.gnss_horizontal_m,
+            gnss_vertical_m: pose.gnss_vertical_m,
+            gnss_floor_m: pose.gnss_floor_m,
+            heading_deg: 2.0,
+            tilt_deg: 0.5,
+            gnss_correlation_s: track.gnss_correlation_s,
+            heading_correlation_s: track.heading_correlation_s,
+        }
+    }
+}
+
+#[derive(Deserialize)]
+#[serde(default)]
+struct RawTrack {
+    confirm_sightings: u32,
+    confirm_span_s: f64,
+    forget_suspected_s: f64,
+}
+
+impl Default for RawTrack {
+    fn default() -> Self {
+        let track = TrackConfig::default();
+        Self {
+            confirm_sightings: track.confirm_sightings,
+            confirm_span_s: track.confirm_span_s,
+            forget_suspected_s: track.forget_suspected_s,
+        }
+    }
+}
+
+#[derive(Deserialize)]
+#[serde(default)]
+struct RawGround {
+    url: Option<String>,
+    agent_system_id: u8,
+    agent_component_id: u8,
+}
+
+impl Default for RawGround {
+    fn default() -> Self {
+        Self { url: None, agent_system_id: 254, agent_component_id: 191 }
+    }
+}
+
+#[derive(Deserialize, Default)]
+struct RawState {
+    dir: Option<PathBuf>,
+}
+
+const KNOWN: &[&str] = &[
+    "name",
+    "uav",
+    "rig",
+    "datum.latitude_deg",
+    "datum.longitude_deg",
+    "datum.height_ellipsoid_m",
+    "vehicle.system_id",
+    "mavlink.url",
+    "camera.url",
+    "model.path",
+    "model.sha256",
+    "model.family",
+    "model.threshold",
+    "model.whole_frame_only",
+    "model.tile_px",
+    "model.overlap_px",
+    "model.threads",
+    "range.max_disparity_px",
+    "range.max_sigma_over_range",
+    "terrain.kind",
+    "terrain.height_ellipsoid_m",
+    "terrain.sigma_m",
+    "sigma.gnss_horizontal_m",
+    "sigma.gnss_vertical_m",
+    "sigma.gnss_floor_m",
+    "sigma.heading_deg",
+    "sigma.tilt_deg",
+    "sigma.gnss_correlation_s",
+    "sigma.heading_correlation_s",
+    "track.confirm_sightings",
+    "track.confirm_span_s",
+    "track.forget_suspected_s",
+    "ground.url",
+    "ground.agent_system_id",
+    "ground.agent_component_id",
+    "state.dir",
+    "sim.*",
+];
+
+impl Mission {
+    /// Reads and checks a mission file and the rig that it names.
+    ///
+    /// # Errors
+    /// [`MissionError`] naming the file and every problem.
+    pub fn load(path: &Path) -> Result<Self, MissionError> {
+        let text = std::fs::read_to_string(path)
+            .map_err(|source| MissionError::Read { path: path.to_owned(), source })?;
+        let raw = parse(&text, path)?;
+        build(raw, path)
+    }
+}
+
+fn parse(text: &str, path: &Path) -> Result<RawMission, MissionError> {
+    let syntax = |error: toml::de::Error| MissionError::Syntax {
+        path: path.to_owned(),
+        message: error.to_string().trim_end().to_owned(),
+    };
+    let values = |problems| MissionError::Values { path: path.to_owned(), problems };
+    let table: toml::Table = toml::from_str(text).map_err(syntax)?;
+    let unknown: Vec<String> =
+        unknown_keys(&table, KNOWN).iter().map(KeyProblem::to_string).collect();
+    let raw: RawMission = match toml::from_str(text) {
+        Ok(raw) => raw,
+        Err(_) if !unknown.is_empty() => return Err(values(unknown)),
+        Err(error) => return Err(syntax(error)),
+    };
+    let mut problems = unknown;
+    problems.extend(check(&raw));
+    if problems.is_empty() { Ok(raw) } else { Err(values(problems)) }
+}
+
+fn check(raw: &RawMission) -> Vec<String> {
+    let mut checks = Checks::new();
+    let name_is_fit = |name: &str| {
+        (1..=32).contains(&name.len())
+            && name.chars().all(|c| c.is_ascii_alphanumeric() || c == '-' || c == '_')
+    };
+    for (key, name) in [("name", &raw.name), ("uav", &raw.uav)] {
+        if !name_is_fit(name) {
+            checks.problem(format!("{key} is {name:?}, allowed are 1 to 32 letters, digits, - and _"));
+        }
+    }
+    checks.range("datum.latitude_deg", raw.datum.latitude_deg, -90.0, 90.0, "");
+    checks.range("datum.longitude_deg", raw.datum.longitude_deg, -180.0, 180.0, "");
+    checks.range("datum.height_ellipsoid_m", raw.datum.height_ellipsoid_m, -500.0, 9000.0, "");
+    check_numbers(&mut checks, raw);
+    if let Some(terrain) = &raw.terrain {
+        if terrain.kind != "plane" {
+            checks.problem(format!("terrain.kind is {:?}, allowed is \"plane\"", terrain.kind));
+        }
+        checks.range("terrain.height_ellipsoid_m", terrain.height_ellipsoid_m, -500.0, 9000.0, "");
+        checks.range("terrain.sigma_m", terrain.sigma_m, 0.05, 500.0, " (never perfectly flat)");
+    }
+    check_sigma(&mut checks, &raw.sigma);
+    checks.range("track.confirm_sightings", f64::from(raw.track.confirm_sightings), 2.0, 100.0, "");
+    checks.range("track.confirm_span_s", raw.track.confirm_span_s, 0.0, 60.0, "");
+    checks.range("track.forget_suspected_s", raw.track.forget_suspected_s, 1.0, 3600.0, "");
+    checks.into_problems()
+}
+
+/// What the rooms check themselves, with the mission's key in front.
+fn check_numbers(checks: &mut Checks, raw: &RawMission) {
+    let model = detector(&raw.model, &Path::to_owned).problems();
+    let range = range(&raw.range).problems();
+    let named = |table: &'static str| move |problem: String| format!("{table}.{problem}");
+    model.into_iter().map(named("model")).for_each(|problem| checks.problem(problem));
+    range.into_iter().map(named("range")).for_each(|problem| checks.problem(problem));
+}
+
+fn check_sigma(checks: &mut Checks, sigma: &RawSigma) {
+    checks.range("sigma.gnss_horizontal_m", sigma.gnss_horizontal_m, 0.005, 100.0, "");
+    checks.range("sigma.gnss_vertical_m", sigma.gnss_vertical_m, 0.005, 100.0, "");
+    checks.range("sigma.gnss_floor_m", sigma.gnss_floor_m, 0.001, 100.0, "");
+    checks.range("sigma.heading_deg", sigma.heading_deg, 0.01, 180.0, " (degrees)");
+    checks.range("sigma.tilt_deg", sigma.tilt_deg, 0.01, 45.0, " (degrees)");
+    checks.range("sigma.gnss_correlation_s", sigma.gnss_correlation_s, 1.0, 1e6, "");
+    checks.range("sigma.heading_correlation_s", sigma.heading_correlation_s, 1.0, 1e6, "");
+}
+
+fn build(raw: RawMission, path: &Path) -> Result<Mission, MissionError> {
+    let beside = |relative: &Path| path.parent().unwrap_or(Path::new(".")).join(relative);
+    let rig = Rig::load(&beside(&raw.rig))
+        .map_err(|source| MissionError::Rig { path: path.to_owned(), source })?;
+    let datum = place_from_degrees(
+        raw.datum.latitude_deg,
+        raw.datum.longitude_deg,
+        EllipsoidHeight::from_m(raw.datum.height_ellipsoid_m),
+    )
+    .map_err(|error| MissionError::Values {
+        path: path.to_owned(),
+        problems: vec![format!("datum: {error}")],
+    })?;
+    let terrain = raw.terrain.as_ref().map(|plane| -> Arc<dyn Terrain> {
+        let height = EllipsoidHeight::from_m(plane.height_ellipsoid_m);
+        Arc::new(ConstantPlane { height, sigma_m: plane.sigma_m })
+    });
+    let state_dir = raw.state.dir.as_deref().map_or_else(
+        || Path::new(".emberfix").join(&raw.name),
+        beside,
+    );
+    Ok(Mission {
+        detector: detector(&raw.model, &beside),
+        range: range(&raw.range),
+        pose: PoseConfig {
+            gnss_horizontal_m: raw.sigma.gnss_horizontal_m,
+            gnss_vertical_m: raw.sigma.gnss_vertical_m,
+            gnss_floor_m: raw.sigma.gnss_floor_m,
+            ..PoseConfig::default()
+        },
+        shared: SharedSigmas {
+            heading_rad: raw.sigma.heading_deg.to_radians(),
+            tilt_rad: raw.sigma.tilt_deg.to_radians(),
+        },
+        track: TrackConfig {
+            confirm_sightings: raw.track.confirm_sightings,
+            confirm_span_s: raw.track.confirm_span_s,
+            gnss_correlation_s: raw.sigma.gnss_correlation_s,
+            heading_correlation_s: raw.sigma.heading_correlation_s,
+            forget_suspected_s: raw.track.forget_suspected_s,
+        },
+        ground: GroundLinks {
+            url: raw.ground.url,
+            agent: (raw.ground.agent_system_id, raw.ground.agent_component_id),
+        },
+        name: raw.name,
+        uav: raw.uav,
+        rig: Arc::new(rig),
+        datum,
+        system_id: raw.vehicle.system_id,
+        mavlink_url: raw.mavlink.url,
+        camera_url: raw.camera.url,
+        terrain,
+        state_dir,
+    })
+}
+
+fn detector(raw: &RawModel, beside: &dyn Fn(&Path) -> PathBuf) -> DetectorConfig {
+    let usual = DetectorConfig::new(beside(&raw.path));
+    DetectorConfig {
+        sha256: raw.sha256.clone(),
+        family: raw.family,
+        threshold: raw.threshold,
+        tile_px: if raw.whole_frame_only { None } else { raw.tile_px.or(usual.tile_px) },
+        overlap_px: raw.overlap_px.unwrap_or(usual.overlap_px),
+        threads: raw.threads.map_or(usual.threads, |threads| threads as usize),
+        ..usual
+    }
+}
+
+fn range(raw: &RawRange) -> SgbmConfig {
+    let usual = SgbmConfig::default();
+    SgbmConfig {
+        num_disparities: raw.max_disparity_px.unwrap_or(usual.num_disparities),
+        max_sigma_over_range: raw.max_sigma_over_range.unwrap_or(usual.max_sigma_over_range),
+        ..usual
+    }
+}

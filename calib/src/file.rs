@@ -1,6 +1,6 @@
 //! The rig file: raw TOML to a checked [`Rig`], every problem at once.
 
-use crate::{Camera, Eye, KeyProblem, Rectification, Rig, RigSigmas, unknown_keys};
+use crate::{Camera, Checks, Eye, KeyProblem, Rectification, Rig, RigSigmas, unknown_keys};
 use emberfix_frames::{Metres, MountAngles, Vector, Vector3};
 use serde::Deserialize;
 use std::path::{Path, PathBuf};
@@ -122,7 +122,7 @@ pub(crate) fn load(path: &Path) -> Result<Rig, RigError> {
 pub(crate) fn parse(text: &str, path: &Path) -> Result<Rig, RigError> {
     let syntax = |error: toml::de::Error| RigError::Syntax {
         path: path.to_owned(),
-        message: error.to_string().trim_end().to_owned(),
+        message: one_line(text, &error),
     };
     let table: toml::Table = toml::from_str(text).map_err(syntax)?;
     let unknown: Vec<String> =
@@ -141,27 +141,32 @@ pub(crate) fn parse(text: &str, path: &Path) -> Result<Rig, RigError> {
     build(raw, path)
 }
 
+/// What the TOML reader says, with the line that it says it of.
+fn one_line(text: &str, error: &toml::de::Error) -> String {
+    let message = error.message().replace('\n', ", ");
+    match error.span().and_then(|span| text.get(..span.start)) {
+        Some(before) => {
+            let number = before.matches('\n').count();
+            let line = text.lines().nth(number).unwrap_or_default().trim();
+            format!("line {} ({line}): {message}", number + 1)
+        }
+        None => message,
+    }
+}
+
 fn values(path: &Path, problems: Vec<String>) -> RigError {
     RigError::Values { path: path.to_owned(), problems }
 }
 
-/// Collects "key is value, allowed is range" for values out of range; NaN is always out.
-struct Checks(Vec<String>);
-
-impl Checks {
-    fn range(&mut self, key: &str, value: f64, low: f64, high: f64, hint: &str) {
-        if !(low..=high).contains(&value) {
-            self.0.push(format!("{key} is {value}, allowed is {low} to {high}{hint}"));
-        }
-    }
-}
-
 fn check(raw: &RawRig) -> Vec<String> {
-    let mut checks = Checks(Vec::new());
+    let mut checks = Checks::new();
+    if raw.name.trim().is_empty() {
+        checks.problem(format!("name is {:?}, needed is a word for reports", raw.name));
+    }
     check_camera(&mut checks, "left", &raw.left);
     check_camera(&mut checks, "right", &raw.right);
     if raw.left.image_size_px != raw.right.image_size_px {
-        checks.0.push(format!(
+        checks.problem(format!(
             "right.image_size_px is {:?}, left.image_size_px is {:?}; both eyes need one size",
             raw.right.image_size_px, raw.left.image_size_px
         ));
@@ -174,7 +179,7 @@ fn check(raw: &RawRig) -> Vec<String> {
     checks.range("sigma.boresight_deg", sigma.boresight_deg, 0.0, 45.0, "");
     checks.range("sigma.lever_arm_m", sigma.lever_arm_m, 0.0, 5.0, "");
     checks.range("sigma.time_offset_s", sigma.time_offset_s, 0.0, 2.0, "");
-    checks.0
+    checks.into_problems()
 }
 
 fn check_camera(checks: &mut Checks, eye: &str, camera: &RawCamera) {
@@ -188,7 +193,7 @@ fn check_camera(checks: &mut Checks, eye: &str, camera: &RawCamera) {
     checks.range(&format!("{eye}.principal_point_px[0]"), cx, 0.0, width - 1.0, "");
     checks.range(&format!("{eye}.principal_point_px[1]"), cy, 0.0, height - 1.0, "");
     if camera.distortion.len() != 5 {
-        checks.0.push(format!(
+        checks.problem(format!(
             "{eye}.distortion has {} terms, needed are 5 (k1, k2, p1, p2, k3)",
             camera.distortion.len()
         ));
@@ -206,14 +211,15 @@ fn check_stereo(checks: &mut Checks, stereo: &RawStereo) {
     let [x, y, z] = stereo.right_from_left_translation_m;
     checks.range("stereo.max_skew_s", stereo.max_skew_s, 0.0, 0.1, " (seconds)");
     if x > 0.0 {
-        checks.0.push(format!(
+        checks.problem(format!(
             "stereo.right_from_left_translation_m[0] is {x}, allowed is below 0: the eyes are \
              swapped, or the translation is that of left from right"
         ));
         return;
     }
     let baseline = Vector3::new(x, y, z).norm();
-    checks.range("stereo baseline", baseline, 0.005, 5.0, " (metres, not mm)");
+    let baseline_hint = " (the baseline in metres, not mm)";
+    checks.range("stereo.right_from_left_translation_m", baseline, 0.005, 5.0, baseline_hint);
     checks.range("stereo.right_from_left_translation_m[1]", y, x, -x, " (eyes one above the other)");
 }
 

@@ -10,9 +10,11 @@
 mod file;
 mod nearest;
 mod rectify;
+#[cfg(test)]
+mod tests;
 
 pub use file::RigError;
-pub use nearest::{KeyProblem, nearest_key, unknown_keys};
+pub use nearest::{Checks, KeyProblem, nearest_key, unknown_keys};
 pub use rectify::Rectification;
 
 use emberfix_frames::{
@@ -187,8 +189,15 @@ impl Rig {
     /// Direction of a rectified left pixel: metres in [`CamLeft`] per metre of depth.
     #[must_use]
     pub fn ray(&self, pixel: RectifiedPixel) -> Vector<CamLeft> {
-        let (focal, (cx, cy)) = (self.rectification.focal_px(), self.rectification.principal_point_px());
-        Vector::from_metres(Vector3::new((pixel.u - cx) / focal, (pixel.v - cy) / focal, 1.0))
+        let (focal, (cx, cy)) = (
+            self.rectification.focal_px(),
+            self.rectification.principal_point_px(),
+        );
+        Vector::from_metres(Vector3::new(
+            (pixel.u - cx) / focal,
+            (pixel.v - cy) / focal,
+            1.0,
+        ))
     }
 
     /// The point at `depth_m` along the boresight behind a rectified left pixel.

@@ -1,4 +1,5 @@
-//! Helpful words for keys that a configuration file should not have.
+//! Helpful words for keys and values that a configuration file should not have; shared by every
+//! file that the project reads.
 
 /// One key that nothing reads.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -64,7 +65,41 @@ fn collect(table: &toml::Table, prefix: &str, known: &[&str], found: &mut Vec<Ke
 }
 
 fn has_children(key: &str, known: &[&str]) -> bool {
-    known.iter().any(|candidate| candidate.starts_with(&format!("{key}.")))
+    known
+        .iter()
+        .any(|candidate| candidate.starts_with(&format!("{key}.")))
+}
+
+/// Collects "key is value, allowed is range" for every value out of range; not-a-number always is.
+#[derive(Debug, Default)]
+pub struct Checks {
+    problems: Vec<String>,
+}
+
+impl Checks {
+    /// No problem yet.
+    #[must_use]
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// Refuses a value outside `low..=high`; `hint` is added to the sentence (unit, usual mistake).
+    pub fn range(&mut self, key: &str, value: f64, low: f64, high: f64, hint: &str) {
+        if !(low..=high).contains(&value) {
+            self.problems.push(format!("{key} is {value}, allowed is {low} to {high}{hint}"));
+        }
+    }
+
+    /// Any other problem, as one sentence that names key, value and remedy.
+    pub fn problem(&mut self, sentence: String) {
+        self.problems.push(sentence);
+    }
+
+    /// All problems, in the order in which they were found.
+    #[must_use]
+    pub fn into_problems(self) -> Vec<String> {
+        self.problems
+    }
 }
 
 #[cfg(test)]

@@ -24,8 +24,13 @@ impl Rectification {
         right_from_left: &Matrix3<f64>,
         translation_m: &Vector3<f64>,
     ) -> Result<Self> {
-        let (mut r1, mut r2, mut p1, mut p2, mut q) =
-            (Mat::default(), Mat::default(), Mat::default(), Mat::default(), Mat::default());
+        let (mut r1, mut r2, mut p1, mut p2, mut q) = (
+            Mat::default(),
+            Mat::default(),
+            Mat::default(),
+            Mat::default(),
+            Mat::default(),
+        );
         let (width, height) = left.image_size_px;
         calib3d::stereo_rectify(
             &camera_matrix(left)?,
@@ -101,7 +106,10 @@ impl Rectification {
             &matrix_to_mat(&self.projection[index(eye)])?,
             opencv::core::TermCriteria::new(3, 50, UNDISTORT_EPSILON_PX)?,
         )?;
-        Ok(rectified.iter().map(|p| RectifiedPixel { u: p.x, v: p.y }).collect())
+        Ok(rectified
+            .iter()
+            .map(|p| RectifiedPixel { u: p.x, v: p.y })
+            .collect())
     }
 
     /// Rectified pixels to raw pixels, in closed form (the camera model forwards).
@@ -175,7 +183,9 @@ fn distortion(camera: &Camera) -> Result<Mat> {
 
 fn matrix_to_mat(matrix: &Matrix3<f64>) -> Result<Mat> {
     // Column-major here, row-major there.
-    Ok(Mat::from_slice(matrix.transpose().as_slice())?.reshape(1, 3)?.clone_pointee())
+    Ok(Mat::from_slice(matrix.transpose().as_slice())?
+        .reshape(1, 3)?
+        .clone_pointee())
 }
 
 /// The left 3x3 block of a 3x3 or 3x4 matrix.

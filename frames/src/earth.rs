@@ -56,6 +56,14 @@ pub fn place_from_degrees(
         .ok_or(PlaceError::Latitude { deg: latitude_deg })
 }
 
+/// The place of an ECEF point; `None` where no aircraft or fire can be (below -10 km, above 50 km,
+/// or not a number), which is also where the conversion would not be exact.
+#[must_use]
+pub fn place_from_ecef(point: &Coordinate<Ecef>) -> Option<Wgs84> {
+    let finite = point.metres().iter().all(|component| component.is_finite());
+    (finite && point.is_in_fast_wgs84_range()).then(|| point.to_wgs84())
+}
+
 fn wrap_longitude(longitude_deg: f64) -> f64 {
     if (-180.0..=180.0).contains(&longitude_deg) {
         longitude_deg

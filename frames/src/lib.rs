@@ -67,7 +67,7 @@ pub use clocks::{BootTime, ServiceTime, SignedDuration, Stamped, seconds};
 pub use covariance::{Covariance, CovarianceError};
 pub use earth::{
     PlaceError, Wgs84Parts, ecef_from_enu, enu_from_ecef, enu_offset, place_from_degrees,
-    rotation_matrix,
+    place_from_ecef, rotation_matrix,
 };
 pub use geoid::Geoid;
 pub use heights::{EllipsoidHeight, GeoidUndulation, HeightAboveGround, MslAltitude};

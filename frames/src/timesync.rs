@@ -136,6 +136,13 @@ impl TimeSync {
         Some(ServiceTime::from_unix_ns(boot.ns()) + offset)
     }
 
+    /// Our time on the autopilot's clock.
+    #[must_use]
+    pub fn to_boot(&self, service: ServiceTime) -> Option<BootTime> {
+        let offset = self.offset()?;
+        Some(BootTime::from_ns((service - offset).unix_ns()))
+    }
+
     fn quickest(&self) -> Option<&Exchange> {
         self.exchanges.iter().min_by_key(|exchange| exchange.round_trip_ns)
     }

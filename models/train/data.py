@@ -155,7 +155,7 @@ class Mixer:
         for p in real:
             by_set[p.name.split("/")[0]][p.clip].append(p)
         self.sets = [(name, list(clips.values())) for name, clips in by_set.items()]
-        weight = {"continuous_fire6": 0.7, "abonia_cctv": 0.2, "dfire_none99": 0.1}
+        weight = {"continuous_fire6": 0.62, "abonia_cctv": 0.18, "dfire_none99": 0.2}
         self.set_p = np.array([weight.get(n, 0.1) for n, _ in self.sets])
         self.set_p /= self.set_p.sum()
         # Long clips count more than stills, but far less than by their length.
@@ -253,7 +253,9 @@ class Mixer:
         elif kind < (0.60 if self.extra else 0.55):
             self.mosaic(rng, c)
         else:
-            self.single(rng, c, self.real(rng), 0.5, 1.45)
+            self.single(rng, c, self.real(rng), 0.6, 1.4)
+        if rng.random() < 0.2:
+            lamps(rng, c.image)
         img = photometric(rng, c.image)
         boxes = np.array(c.boxes, np.float32).reshape(-1, 5)
         valid = c.valid
@@ -262,6 +264,22 @@ class Mixer:
             img, valid = img[:, ::-1], valid[:, ::-1]
             boxes[:, [1, 3]] = self.side - boxes[:, [3, 1]]
         return np.ascontiguousarray(img), boxes, np.ascontiguousarray(valid)
+
+
+def lamps(rng: Generator, img: np.ndarray) -> None:
+    """Add one to six unlabelled lamps or glints in place: small, round, smooth, nearly white."""
+    h, w = img.shape[:2]
+    for _ in range(int(rng.integers(1, 7))):
+        r = float(np.exp(rng.uniform(np.log(1.2), np.log(9))))
+        n = int(3 * r) + 1
+        if 2 * n >= min(h, w):
+            continue
+        x, y = int(rng.integers(n, w - n)), int(rng.integers(n, h - n))
+        gy, gx = np.mgrid[-n:n, -n:n].astype(np.float32)
+        spot = np.exp(-((gx * rng.uniform(0.4, 1.0)) ** 2 + gy**2) / (r * r)) * rng.uniform(0.8, 2.5)
+        tint = np.array([rng.uniform(110, 255), rng.uniform(200, 255), 255], np.float32)
+        view = img[y - n : y + n, x - n : x + n]
+        view[:] = np.minimum(view + spot[..., None] * tint, 255).astype(np.uint8)
 
 
 def photometric(rng: Generator, img: np.ndarray) -> np.ndarray:

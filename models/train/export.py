@@ -22,7 +22,7 @@ CREDIT = (
 )
 
 
-def export(model: EmberNano, path: Path, threshold: float, version: str, seed: int) -> float:
+def export(model: EmberNano, path: Path, thresholds: dict[str, float], version: str, seed: int) -> float:
     """Export, add metadata, replace `path` in one step; returns the largest difference to PyTorch."""
     model = model.eval()
     sample = torch.randn(1, 3, INPUT, INPUT)
@@ -38,7 +38,8 @@ def export(model: EmberNano, path: Path, threshold: float, version: str, seed: i
         "color": "bgr",
         "mean": json.dumps(MEAN),
         "std": json.dumps(STD),
-        "threshold": f"{threshold:.3f}",
+        "threshold": f"{thresholds[NAMES[0]]:.2f}",
+        "thresholds": json.dumps(thresholds),
         "version": version,
         "seed": str(seed),
         "credit": CREDIT,
@@ -63,7 +64,8 @@ def main() -> None:
     ap = argparse.ArgumentParser(description=__doc__)
     ap.add_argument("--checkpoint", type=Path, help="EMA weights written by train.fit; none = untrained")
     ap.add_argument("--out", type=Path, default=Path("ember-nano.onnx"))
-    ap.add_argument("--threshold", type=float, default=0.4)
+    ap.add_argument("--threshold", type=float, default=0.4, help="fire score, chosen on val")
+    ap.add_argument("--smoke-threshold", type=float, default=0.5, help="smoke score, chosen on val")
     ap.add_argument("--version", default="0.1.0")
     args = ap.parse_args()
     torch.manual_seed(0)
@@ -72,7 +74,9 @@ def main() -> None:
         state = torch.load(args.checkpoint, map_location="cpu", weights_only=True)
         model.load_state_dict(state["ema"])
         seed = int(state["seed"])
-    worst = export(model, args.out, args.threshold, args.version, seed)
+    worst = export(
+        model, args.out, {"fire": args.threshold, "smoke": args.smoke_threshold}, args.version, seed
+    )
     data = args.out.read_bytes()
     params = sum(p.numel() for p in model.parameters())
     print(f"{args.out}: {len(data)} bytes, {params} parameters, largest difference {worst:.2e}")

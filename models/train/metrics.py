@@ -25,7 +25,7 @@ def overlap(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return inter / np.maximum(area - inter, 1e-9)
 
 
-def nms(boxes: np.ndarray, score: np.ndarray, limit: float = 0.6) -> np.ndarray:
+def nms(boxes: np.ndarray, score: np.ndarray, limit: float = 0.5) -> np.ndarray:
     """Indices that survive, best score first."""
     order, keep = np.argsort(-score, kind="stable"), []
     while len(order):
@@ -34,7 +34,7 @@ def nms(boxes: np.ndarray, score: np.ndarray, limit: float = 0.6) -> np.ndarray:
     return np.array(keep, np.int64)
 
 
-def unpack(scores: np.ndarray, boxes: np.ndarray, floor: float = 0.02, limit: float = 0.6, most: int = 400) -> Found:
+def unpack(scores: np.ndarray, boxes: np.ndarray, floor: float = 0.02, limit: float = 0.5, most: int = 400) -> Found:
     """Scores [cells, nc] and boxes [cells, 4] -> detections after per-class suppression."""
     parts: list[tuple[np.ndarray, np.ndarray, int]] = []
     for c in range(scores.shape[1]):

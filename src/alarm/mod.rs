@@ -4,6 +4,10 @@
 //! latitude, ellipsoid height). The position is the base of the fire: where the burning thing
 //! stands, beneath the flame's centre. Pure: no I/O, no clock.
 
+mod desk;
+
+pub use desk::{AlarmDesk, LEAST_S, REPEAT_S, Situation};
+
 use emberfix_frames::{Covariance, EllipsoidHeight, MissionEnu, ServiceTime, Wgs84, Wgs84Parts};
 use serde::{Deserialize, Serialize};
 

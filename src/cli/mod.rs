@@ -1,1 +1,108 @@
-//! cli
+//! Arguments to work: parse, wire, exit.
+//!
+//! Exit codes: 0 done, 1 failed while running, 2 refused (arguments, configuration, model,
+//! calibration, recording). What went wrong is one line on standard error that says what to do.
+
+mod replay;
+mod run;
+
+
+use clap::{Parser, Subcommand};
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+/// Finds fire from a UAV's stereo camera and tells the ground where it is, and how sure.
+#[derive(Debug, Parser)]
+#[command(name = "emberfix", version)]
+struct Arguments {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Runs the service: MAVLink and camera in, alarms out.
+    Run(run::RunArguments),
+    /// Runs a recording (or a .tlog) through the service; the same bytes come out each time.
+    Replay(replay::ReplayArguments),
+    /// Runs the ground station: receives, keeps and shows alarms.
+    Ground(GroundArguments),
+}
+
+#[derive(Debug, clap::Args)]
+struct GroundArguments {
+    /// Configuration, such as missions/ground.toml.
+    config: PathBuf,
+    /// Address to listen on instead of the configured one.
+    #[arg(long)]
+    listen: Option<std::net::SocketAddr>,
+    /// Folder for what must survive instead of the configured one.
+    #[arg(long)]
+    data: Option<PathBuf>,
+    /// MAVLink URL instead of the configured one.
+    #[arg(long)]
+    mavlink: Option<String>,
+}
+
+/// How a command ended, when it did not end well.
+pub(crate) enum Failure {
+    /// Refused before any work: exit code 2.
+    Refused(anyhow::Error),
+    /// Failed while running: exit code 1.
+    Failed(anyhow::Error),
+}
+
+impl Failure {
+    pub(crate) fn refused(error: impl Into<anyhow::Error>) -> Self {
+        Self::Refused(error.into())
+    }
+    pub(crate) fn failed(error: impl Into<anyhow::Error>) -> Self {
+        Self::Failed(error.into())
+    }
+}
+
+/// The whole program.
+#[must_use]
+pub fn main() -> ExitCode {
+    let arguments = Arguments::parse();
+    tracing_subscriber::fmt()
+        .with_env_filter(
+            tracing_subscriber::EnvFilter::try_from_env("EMBERFIX_LOG")
+                .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info,ort=warn")),
+        )
+        .with_writer(std::io::stderr)
+        .init();
+    let done = match arguments.command {
+        Command::Run(arguments) => run::run(arguments),
+        Command::Replay(arguments) => replay::replay(&arguments),
+        Command::Ground(arguments) => ground(arguments),
+    };
+    match done {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(Failure::Refused(error)) => {
+            eprintln!("emberfix: {error:#}");
+            ExitCode::from(2)
+        }
+        Err(Failure::Failed(error)) => {
+            eprintln!("emberfix: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+/// A runtime for the commands that talk.
+pub(crate) fn runtime() -> Result<tokio::runtime::Runtime, Failure> {
+    tokio::runtime::Builder::new_multi_thread().enable_all().build().map_err(Failure::failed)
+}
+
+fn ground(arguments: GroundArguments) -> Result<(), Failure> {
+    let overrides = crate::ground::Overrides {
+        listen: arguments.listen,
+        data_dir: arguments.data,
+        mavlink_url: arguments.mavlink,
+    };
+    let ended = runtime()?.block_on(crate::ground::run(&arguments.config, overrides));
+    ended.map_err(|error| {
+        if error.is_refusal() { Failure::refused(error) } else { Failure::failed(error) }
+    })
+}

@@ -1,1 +1,60 @@
-//! deliver
+//! The durable outbox, and one file per link.
+//!
+//! **Purpose.** An alarm reaches the ground although links fail, slowly fill, and lie.
+//!
+//! **In.** [`crate::alarm::Alarm`]s, and telemetry of the ground agent (its `COMMAND_ACK`s).
+//! **Out.** Over MAVLink, as messages for the pipeline's one connection ([`mavlink`], sans-IO):
+//! STATUSTEXT and CAMERA_TRACKING_GEO_STATUS for stock ground stations, COMMAND_INT for our ground
+//! agent ([`spatial`]). Over links that answer at once ([`AlarmLink`], such as HTTP): whole alarms.
+//!
+//! **The way of one alarm.** [`Outbox::put`] (on disk) -> [`Outbox::pending`] per link, urgent first
+//! -> the link -> its receipt -> [`Outbox::acknowledge`] (on disk). At least once, per link; the
+//! receiver tells repetitions by id and revision.
+//!
+//! **Bounds and loss rules.** The outbox keeps the newest revision of every alarm until each link
+//! delivered it, up to [`Outbox::MAX_WAITING`]; then new alarms are refused loudly. A link with
+//! more news than room sends the newest revision only. STATUSTEXT and CAMERA_TRACKING_GEO_STATUS
+//! are told, not delivered: they may be lost.
+//!
+//! **Ids.** An alarm's id is `<uav>-<fire number>`; an aircraft without a name is
+//! `uav-<MAVLink system id>`. Fire numbers come from the outbox and never repeat on one aircraft.
+//!
+//! **Assumptions.** One service per outbox. Time is an argument; nothing here reads a clock.
+//!
+//! **Known limits.** MAVLink frames are not signed yet: whoever is on the link can acknowledge.
+
+pub mod http;
+pub mod link;
+pub mod mavlink;
+pub mod outbox;
+pub mod spatial;
+
+pub use http::{HttpError, HttpLink};
+pub use link::{AlarmLink, Courier, LinkError, Receipt, Urgency};
+pub use mavlink::{MavlinkDelivery, MavlinkSettings};
+pub use outbox::{Outbox, OutboxError, Put};
+
+use crate::alarm::FireId;
+use emberfix_mav::SystemId;
+
+/// Id of an alarm.
+#[must_use]
+pub fn alarm_id(uav: &str, fire: FireId) -> String {
+    format!("{uav}-{}", fire.0)
+}
+
+/// The fire that an alarm id names.
+#[must_use]
+pub fn fire_number(alarm_id: &str) -> Option<FireId> {
+    let (_, number) = alarm_id.rsplit_once('-')?;
+    number.parse().ok().map(FireId)
+}
+
+/// Name of an aircraft that was given none.
+#[must_use]
+pub fn default_uav(system: SystemId) -> String {
+    format!("uav-{}", system.0)
+}
+
+#[cfg(test)]
+mod tests_support;

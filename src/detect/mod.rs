@@ -1,7 +1,42 @@
 //! What burns, in one image; the only user of ONNX Runtime.
 //!
-//! **In:** [`LeftImage`], the raw (not rectified) left image. **Out:** [`Detection`]s in pixels of
-//! that image.
+//! **Purpose.** Runs a detector over one image and says where fire and smoke stand in it.
+//! **In:** [`LeftImage`], the raw (not rectified) left image, 8-bit BGR, as often as the caller has
+//! one. **Out:** [`Detection`]s in pixels of that image, best first, one list per image.
+//!
+//! - [`OnnxDetector`] runs an ONNX model over the whole frame and over tiles at native resolution,
+//!   and merges what they see: `preprocess` cuts the views, one file per model family turns tensors
+//!   into boxes (`nanodet`, `yolov8`), `nms` makes one box of one flame.
+//! - [`BoxFileDetector`] reads given boxes from a file.
+//!
+//! **Assumptions.** A model file is trusted as far as its hash, its size and its tensors were
+//! checked at load; family, classes and thresholds come from its metadata unless the configuration
+//! says otherwise, and the tensors' shapes decide whether that is true.
+//!
+//! **Known limits.** Batch is 1; weights must stand in the model file itself. A flame of fewer than
+//! about 10 px at the network's input is not seen: without tiles a 1 m fire goes unseen beyond 26 m
+//! at 1280 px, with native tiles beyond 80 m.
+
+mod boxfile;
+mod config;
+mod error;
+mod family;
+#[cfg(test)]
+mod lookalike;
+mod metadata;
+mod model_file;
+mod nanodet;
+mod nms;
+mod onnx;
+mod preprocess;
+mod runtime;
+mod yolov8;
+
+pub use boxfile::{BoxFileDetector, BoxFileError, GivenBox};
+pub use config::{ClassPolicy, DetectorConfig};
+pub use error::ModelError;
+pub use family::Family;
+pub use onnx::{ClassInfo, DetectorInfo, OnnxDetector};
 
 use emberfix_frames::ServiceTime;
 use opencv::core::Mat;
@@ -89,7 +124,17 @@ pub trait Detector: Send {
     fn detect(&mut self, image: &LeftImage) -> Result<Vec<Detection>, DetectError>;
 }
 
-/// Why a frame has no result.
+/// Loads the model that a mission names.
+///
+/// # Errors
+/// [`ModelError`] that names the file, what was expected and what was found.
+pub fn open(config: &DetectorConfig) -> Result<Box<dyn Detector>, ModelError> {
+    let detector = OnnxDetector::load(config)?;
+    tracing::info!(info = ?detector.info(), "model loaded");
+    Ok(Box::new(detector))
+}
+
+/// Why a frame has no result. The next frame may have one: count it and go on.
 #[derive(Debug, thiserror::Error)]
 pub enum DetectError {
     /// Not the pixels that the detector reads.
@@ -98,4 +143,48 @@ pub enum DetectError {
         /// What came.
         found: String,
     },
+    /// The model's answer holds NaN or infinity.
+    #[error("the model's output has {count} values that are not finite numbers, of {of}")]
+    NotFinite {
+        /// How many.
+        count: usize,
+        /// Of how many.
+        of: usize,
+    },
+    /// The model's answer has another shape than at load.
+    #[error("the model answered {found:?}, expected {expected:?}")]
+    Shape {
+        /// As checked at load.
+        expected: Vec<i64>,
+        /// What came.
+        found: Vec<i64>,
+    },
+    /// ONNX Runtime failed.
+    #[error("inference failed: {source}")]
+    Inference {
+        /// What it said.
+        #[from]
+        source: ort::Error,
+    },
+    /// OpenCV refused the image.
+    #[error("preparing the image failed: {source}")]
+    OpenCv {
+        /// What it said.
+        #[from]
+        source: opencv::Error,
+    },
+}
+
+impl DetectError {
+    /// A word for counters.
+    #[must_use]
+    pub fn name(&self) -> &'static str {
+        match self {
+            Self::Image { .. } => "image",
+            Self::NotFinite { .. } => "not_finite",
+            Self::Shape { .. } => "shape",
+            Self::Inference { .. } => "inference",
+            Self::OpenCv { .. } => "opencv",
+        }
+    }
 }

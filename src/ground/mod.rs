@@ -1,1 +1,378 @@
-//! ground
+//! The ground station's side: receive, merge, store, show, pass on.
+//!
+//! **Purpose.** `emberfix ground CONFIG` takes alarms from aircraft over HTTP and over MAVLink, keeps
+//! each one on disk before it acknowledges it, and shows what it has to people and programs.
+//!
+//! **In.** `POST /alarms`: one GeoJSON Feature ([`crate::alarm`]). `POST /track`: where an aircraft
+//! is ([`Ping`]). MAVLink: `COMMAND_INT` `MAV_CMD_SPATIAL_USER_1` (an alarm's summary) and
+//! `GLOBAL_POSITION_INT`.
+//!
+//! **Out.** `GET /alarms.geojson` (FeatureCollection: the newest revision of every incident),
+//! `GET /events` (server-sent events, resumable), `GET /track.geojson`, `GET /health`, and `GET /`,
+//! one page that needs nothing from elsewhere. Places are WGS84 degrees and ellipsoid height.
+//!
+//! **Promises.** An acknowledged alarm is on disk (SQLite, synced). Delivered again it is
+//! acknowledged again and changes nothing; an older revision never replaces a newer one; a summary
+//! that came over MAVLink never replaces the whole alarm of the same revision.
+//!
+//! **Assumptions.** Whoever can reach the address may post: there is no authentication yet, so it
+//! must be a loopback address unless the configuration says `allow_remote = true`.
+//!
+//! **Known limits.** Sightings of one fire by several aircraft stay several incidents. Aircraft
+//! tracks live in memory ([`tracks::MAX_POINTS`] points each) and start anew with the process.
+
+pub mod config;
+mod events;
+mod http;
+mod listener;
+mod mavlink;
+pub mod store;
+#[cfg(test)]
+mod tests;
+pub mod tracks;
+
+pub use config::{ConfigError, GroundConfig, Overrides};
+pub use store::StoreError;
+pub use tracks::{Ping, PingError};
+
+use crate::alarm::{Alarm, AlarmError};
+use emberfix_frames::{CovarianceError, ServiceTime};
+use emberfix_mav::{Link, LinkError};
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use store::{Completeness, Delivery, Kept, Store};
+use tokio::sync::{broadcast, watch};
+use tokio::task::JoinHandle;
+use tracks::{Source, Tracks};
+
+/// Notices that a slow event stream may lag behind; the oldest are then skipped, for it.
+const NOTICES_QUEUED: usize = 64;
+/// Longest reason of a refusal that is shown, characters: it may quote what came.
+const MAX_REASON: usize = 300;
+/// How long open requests may go on after a stop was asked for.
+const GRACE: Duration = Duration::from_secs(3);
+
+/// Why the ground station did not start, or stopped.
+#[derive(Debug, thiserror::Error)]
+pub enum GroundError {
+    /// The configuration was refused.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    /// The store can't be opened or used.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// The address can't be listened on.
+    #[error("can't listen on {address}: {source}")]
+    Listen {
+        /// The address.
+        address: SocketAddr,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The MAVLink port can't be opened.
+    #[error(transparent)]
+    Mavlink(#[from] LinkError),
+    /// The HTTP server ended.
+    #[error("the HTTP server ended: {source}")]
+    Serve {
+        /// What the system said.
+        source: std::io::Error,
+    },
+}
+
+impl GroundError {
+    /// True when the configuration is to blame (exit code 2), not the run (exit code 1).
+    #[must_use]
+    pub fn is_refusal(&self) -> bool {
+        matches!(self, Self::Config(_))
+    }
+}
+
+/// Why an alarm was not taken.
+#[derive(Debug, thiserror::Error)]
+pub enum ReceiveError {
+    /// It is no alarm.
+    #[error(transparent)]
+    Alarm(#[from] AlarmError),
+    /// Its covariance is none.
+    #[error("alarm property covariance_enu_m2: {source}")]
+    Covariance {
+        /// What is wrong with the matrix.
+        #[from]
+        source: CovarianceError,
+    },
+    /// It could not be kept.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+}
+
+/// Runs the ground station until SIGINT or SIGTERM.
+///
+/// # Errors
+/// [`GroundError`]; see [`GroundError::is_refusal`] for the exit code.
+pub async fn run(config: &Path, overrides: Overrides) -> Result<(), GroundError> {
+    let config = GroundConfig::load(config, overrides)?;
+    let data_dir = config.data_dir.clone();
+    let ground = Ground::start(config).await?;
+    // The line that people and programs wait for; with port 0 only it knows the port.
+    println!(
+        "emberfix ground: http://{} keeps alarms in {}",
+        ground.address(),
+        data_dir.display()
+    );
+    ground.run_until(stop_signal()).await
+}
+
+async fn stop_signal() {
+    use tokio::signal::unix::{SignalKind, signal};
+    let Ok(mut terminate) = signal(SignalKind::terminate()) else {
+        return std::future::pending().await;
+    };
+    tokio::select! {
+        _ = terminate.recv() => {}
+        _ = tokio::signal::ctrl_c() => {}
+    }
+}
+
+/// A running ground station.
+#[derive(Debug)]
+pub struct Ground {
+    address: SocketAddr,
+    station: Arc<Station>,
+    server: JoinHandle<std::io::Result<()>>,
+}
+
+impl Ground {
+    /// Opens the store, listens, and starts to serve.
+    ///
+    /// # Errors
+    /// [`GroundError`] when the store or the address can't be opened.
+    pub async fn start(config: GroundConfig) -> Result<Self, GroundError> {
+        let station = Arc::new(Station::open(&config)?);
+        if let Some(mavlink) = config.mavlink {
+            let link = Link::open(&mavlink.url).await?;
+            tokio::spawn(mavlink::run(
+                Arc::clone(&station),
+                link,
+                mavlink,
+                config.uavs,
+            ));
+        }
+        let in_use = |source| GroundError::Listen {
+            address: config.listen,
+            source,
+        };
+        let socket = tokio::net::TcpListener::bind(config.listen)
+            .await
+            .map_err(in_use)?;
+        let address = socket.local_addr().map_err(in_use)?;
+        let names = Arc::from(config.host_names.as_slice());
+        let app = http::router(Arc::clone(&station), names);
+        let mut stopping = station.stopping.subscribe();
+        let server = axum::serve(
+            listener::Bounded::new(socket, listener::Limits::default()),
+            app,
+        )
+        .with_graceful_shutdown(async move { drop(stopping.wait_for(|stop| *stop).await) });
+        let server = tokio::spawn(async move { server.await });
+        Ok(Self {
+            address,
+            station,
+            server,
+        })
+    }
+
+    /// The address that it listens on.
+    #[must_use]
+    pub fn address(&self) -> SocketAddr {
+        self.address
+    }
+
+    /// Stops: open event streams end, open requests get [`GRACE`] to finish.
+    ///
+    /// # Errors
+    /// [`GroundError::Serve`] when the server had already failed.
+    pub async fn stop(self) -> Result<(), GroundError> {
+        self.run_until(std::future::ready(())).await
+    }
+
+    async fn run_until(mut self, stop: impl Future<Output = ()>) -> Result<(), GroundError> {
+        tokio::select! {
+            ended = &mut self.server => return served(ended),
+            () = stop => {}
+        }
+        self.station.stopping.send_replace(true);
+        match tokio::time::timeout(GRACE, &mut self.server).await {
+            Ok(ended) => served(ended),
+            Err(_) => {
+                self.server.abort();
+                Ok(())
+            }
+        }
+    }
+}
+
+fn served(ended: Result<std::io::Result<()>, tokio::task::JoinError>) -> Result<(), GroundError> {
+    let source = match ended {
+        Ok(Ok(())) => return Ok(()),
+        Ok(Err(source)) => source,
+        Err(source) => std::io::Error::other(source),
+    };
+    Err(GroundError::Serve { source })
+}
+
+/// Something that open event streams tell, and that is not repeated to later ones.
+#[derive(Debug, Clone)]
+struct Notice {
+    /// Name of the event.
+    kind: &'static str,
+    /// JSON on one line.
+    data: Arc<str>,
+}
+
+/// What every edge of the ground station shares.
+#[derive(Debug)]
+pub(crate) struct Station {
+    store: Arc<Store>,
+    tracks: Mutex<Tracks>,
+    /// Newest row that streams should tell; streams read the rows themselves, from the store.
+    newest_row: watch::Sender<i64>,
+    /// What is told once. Bound: [`NOTICES_QUEUED`]; loss: oldest first, per stream.
+    notices: broadcast::Sender<Notice>,
+    stopping: watch::Sender<bool>,
+    counters: Counters,
+    mavlink: Mutex<Option<mavlink::LinkHealth>>,
+}
+
+#[derive(Debug, Default)]
+struct Counters {
+    stored: AtomicU64,
+    repeated: AtomicU64,
+    refused: AtomicU64,
+    streams: AtomicU64,
+}
+
+impl Station {
+    fn open(config: &GroundConfig) -> Result<Self, GroundError> {
+        let store = Store::open(&config.data_dir)?;
+        let newest = store.newest_row()?;
+        Ok(Self {
+            store: Arc::new(store),
+            tracks: Mutex::default(),
+            newest_row: watch::Sender::new(newest),
+            notices: broadcast::Sender::new(NOTICES_QUEUED),
+            stopping: watch::Sender::new(false),
+            counters: Counters::default(),
+            mavlink: Mutex::default(),
+        })
+    }
+
+    /// Checks and keeps one alarm; when this returns `Ok`, it is on disk.
+    async fn receive(
+        &self,
+        raw: &[u8],
+        link: &'static str,
+        completeness: Completeness,
+    ) -> Result<(Alarm, Kept), ReceiveError> {
+        let kept = self.check_and_keep(raw, link, completeness).await;
+        match &kept {
+            Ok((_, Kept::New { .. })) => self.counters.stored.fetch_add(1, Ordering::Relaxed),
+            Ok((_, Kept::Again)) => self.counters.repeated.fetch_add(1, Ordering::Relaxed),
+            Err(error) => {
+                self.refuse(error, link);
+                return kept;
+            }
+        };
+        kept
+    }
+
+    async fn check_and_keep(
+        &self,
+        raw: &[u8],
+        link: &'static str,
+        completeness: Completeness,
+    ) -> Result<(Alarm, Kept), ReceiveError> {
+        let alarm = Alarm::from_geojson(raw)?;
+        alarm.covariance()?;
+        let delivery = Delivery {
+            alarm: alarm.clone(),
+            raw: String::from_utf8_lossy(raw).into_owned(),
+            received_at: now(),
+            link,
+            completeness,
+        };
+        let kept = self.with_store(move |store| store.keep(&delivery)).await?;
+        if let Kept::New { row, tells: true } = kept {
+            self.newest_row.send_if_modified(|newest| {
+                let newer = row > *newest;
+                *newest = row.max(*newest);
+                newer
+            });
+        }
+        Ok((alarm, kept))
+    }
+
+    /// Runs work on the store where it may block.
+    async fn with_store<T: Send + 'static>(
+        &self,
+        work: impl FnOnce(&Store) -> Result<T, StoreError> + Send + 'static,
+    ) -> Result<T, StoreError> {
+        let store = Arc::clone(&self.store);
+        tokio::task::spawn_blocking(move || work(&store))
+            .await
+            .unwrap_or(Err(StoreError::Stopped))
+    }
+
+    /// Takes a position and passes it on to the open streams.
+    fn moved(&self, ping: Ping, source: Source) -> Result<(), PingError> {
+        if let Some(told) = self.tracks().take(ping, source)? {
+            self.tell(Notice {
+                kind: "track",
+                data: told.into(),
+            });
+        }
+        Ok(())
+    }
+
+    /// Counts a refusal and shows it: an alarm that did not get in is news, too.
+    fn refuse(&self, error: &dyn std::error::Error, link: &'static str) {
+        self.counters.refused.fetch_add(1, Ordering::Relaxed);
+        tracing::warn!(%error, link, "an alarm was refused");
+        let reason: String = error.to_string().chars().take(MAX_REASON).collect();
+        let data = serde_json::json!({ "at": now().rfc3339(), "link": link, "reason": reason });
+        self.tell(Notice {
+            kind: "refused",
+            data: data.to_string().into(),
+        });
+    }
+
+    fn tell(&self, notice: Notice) {
+        // No receiver only means that nobody watches.
+        let _ = self.notices.send(notice);
+    }
+
+    fn tracks(&self) -> MutexGuard<'_, Tracks> {
+        lock(&self.tracks)
+    }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// UTC by the ground's own clock.
+fn now() -> ServiceTime {
+    let since = SystemTime::now()
+        .duration_since(UNIX_EPOCH)
+        .unwrap_or_default();
+    ServiceTime::from_unix_ns(i64::try_from(since.as_nanos()).unwrap_or(i64::MAX))
+}
+
+/// The database file in a data directory.
+#[must_use]
+pub fn database_in(data_dir: &Path) -> PathBuf {
+    data_dir.join("ground.sqlite")
+}

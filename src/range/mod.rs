@@ -1,8 +1,32 @@
 //! Box to a range with its error, or why not; the only stereo use of OpenCV.
 //!
-//! **In:** the decoded pair and a box in the raw left image. **Out:** [`Ranging`].
+//! **Purpose.** Finds the disparity of one target: rectifies what is around its box (`patch`), keeps
+//! the pixels that look like flame (`mask`), matches them in the right eye by semi-global matching
+//! or by correlation, and pools them (`pool`) to one disparity with its error.
+//! **In:** the decoded pair, raw, and a box in the raw left image; once per detection. **Out:**
+//! [`Ranging`]: a disparity in rectified pixels (`u_left - u_right`, positive in front), its sigma
+//! and the centroid of the pixels that it rests on, or a named reason why there is none.
+//!
+//! **Assumptions.** Both eyes were exposed within the rig's skew, and the rig's calibration holds.
+//! Depth follows from the *mean disparity*; the mean of depths would be pulled outwards.
+//!
+//! **Known limits.** Flames have no surface: the disparity is that of their visible outline and
+//! texture. What is matched in smoke is the ground that shows through it (on rendered plumes at 20 m
+//! the disparity came out a quarter too small), so smoke is always [`Ranging::NoMatch`]. The sigma
+//! is that of matching alone: calibration's share stands in the rig.
 
-use crate::detect::BoxPx;
+mod correlate;
+mod mask;
+mod patch;
+mod pool;
+mod sgbm;
+#[cfg(test)]
+mod tests;
+
+pub use mask::HsvMask;
+pub use sgbm::{MatchMethod, SgbmConfig, SgbmRanger};
+
+use crate::detect::{BoxPx, DetectionClass};
 use emberfix_calib::RectifiedPixel;
 use emberfix_frames::ServiceTime;
 use opencv::core::Mat;
@@ -21,6 +45,8 @@ pub struct RawPair {
 /// What to range.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Target {
+    /// What it is: the ground behind shows through smoke, so only the rest is matched.
+    pub class: DetectionClass,
     /// Box in the raw left image.
     pub box_px: BoxPx,
 }
@@ -71,6 +97,12 @@ pub enum RangeError {
         width: u32,
         /// Rows of the rig.
         height: u32,
+    },
+    /// Not the pixels that are matched.
+    #[error("image is {found}, needed are 8-bit BGR on the left and 8-bit gray on the right")]
+    Pixels {
+        /// What came.
+        found: String,
     },
     /// OpenCV refused.
     #[error("stereo matching failed: {source}")]

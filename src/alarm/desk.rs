@@ -1,0 +1,156 @@
+//! When a fire is told, and when told again.
+
+use super::{Alarm, AlarmProperties, FireId, FireState};
+use crate::track::Fire;
+use emberfix_frames::{
+    Covariance, HeightAboveGround, MissionEnu, MslAltitude, ServiceTime, Wgs84,
+    enu_offset,
+};
+use std::collections::BTreeMap;
+
+/// Where a fire is on the Earth, as far as the alarm needs it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Situation {
+    /// Base of the fire.
+    pub place: Wgs84,
+    /// Above mean sea level.
+    pub altitude: MslAltitude,
+    /// Above the terrain model, where one is known.
+    pub above_ground: Option<HeightAboveGround>,
+    /// Reasons why the ellipse is wider than it could be.
+    pub degraded: Vec<String>,
+}
+
+/// Decides which fires to tell, and writes their alarms.
+///
+/// A fire is told when it is confirmed. It is told again when its state changes, when it moved by
+/// more than half of the CE90 that was told, when CE90 fell below 0.7 of what was told, and every
+/// [`REPEAT_S`] while it is still seen; except for changes of state never more often than every
+/// [`LEAST_S`], so that a busy scene leaves the link to new fires.
+#[derive(Debug)]
+pub struct AlarmDesk {
+    uav: String,
+    told: BTreeMap<FireId, Told>,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Told {
+    revision: u32,
+    state: FireState,
+    place: Wgs84,
+    ce90_m: f64,
+    captured_at: ServiceTime,
+}
+
+/// Seconds after which a fire that is still seen is told again.
+pub const REPEAT_S: f64 = 10.0;
+/// Seconds between two revisions that only better the position.
+pub const LEAST_S: f64 = 1.0;
+/// Share of the told CE90 by which a position must move to be told again.
+const MOVED: f64 = 0.5;
+/// Share of the told CE90 below which a better one is told again.
+const BETTER: f64 = 0.7;
+
+impl AlarmDesk {
+    /// Nothing told yet; `uav` names the aircraft in every alarm.
+    #[must_use]
+    pub fn new(uav: String) -> Self {
+        Self { uav, told: BTreeMap::new() }
+    }
+
+    /// The alarms that are due. `situate` places a fire on the Earth; one that is nowhere on it is
+    /// not told.
+    pub fn due(
+        &mut self,
+        fires: &[Fire],
+        mut situate: impl FnMut(&Fire) -> Option<Situation>,
+    ) -> Vec<Alarm> {
+        let mut due = Vec::new();
+        for fire in fires.iter().filter(|fire| fire.is_confirmed()) {
+            let never_told = !self.told.contains_key(&fire.id);
+            if never_told && fire.state == FireState::Out {
+                continue;
+            }
+            let Some(situation) = situate(fire) else {
+                continue;
+            };
+            let covariance = fire.covariance();
+            if self.is_due(fire, &situation, &covariance) {
+                due.push(self.write(fire, situation, &covariance));
+            }
+        }
+        due
+    }
+
+    /// The id that a fire has in alarms.
+    #[must_use]
+    pub fn id(&self, fire: FireId) -> String {
+        format!("{}-{}", self.uav, fire.0)
+    }
+
+    /// A sighting's Feature with the aircraft's name and the fire's id.
+    #[must_use]
+    pub fn signed(&self, fire: Option<FireId>, mut feature: serde_json::Value) -> serde_json::Value {
+        feature["properties"]["uav"] = self.uav.clone().into();
+        feature["properties"]["fire"] = fire.map(|fire| self.id(fire)).into();
+        feature
+    }
+
+    fn is_due(
+        &self,
+        fire: &Fire,
+        situation: &Situation,
+        covariance: &Covariance<MissionEnu>,
+    ) -> bool {
+        let Some(told) = self.told.get(&fire.id) else {
+            return true;
+        };
+        if told.state != fire.state {
+            return true;
+        }
+        let since_s = (fire.last_seen - told.captured_at).as_secs_f64();
+        let moved_m = enu_offset(&told.place, &situation.place).xy().norm();
+        let changed =
+            moved_m > MOVED * told.ce90_m || covariance.ce90_m() < BETTER * told.ce90_m;
+        since_s >= REPEAT_S || (changed && since_s >= LEAST_S)
+    }
+
+    fn write(
+        &mut self,
+        fire: &Fire,
+        situation: Situation,
+        covariance: &Covariance<MissionEnu>,
+    ) -> Alarm {
+        let ce90_m = covariance.ce90_m();
+        let revision = self.told.get(&fire.id).map_or(1, |told| told.revision + 1);
+        let place = situation.place;
+        self.told.insert(
+            fire.id,
+            Told { revision, state: fire.state, place, ce90_m, captured_at: fire.last_seen },
+        );
+        Alarm {
+            place,
+            properties: AlarmProperties {
+                id: self.id(fire.id),
+                revision,
+                uav: self.uav.clone(),
+                class: fire.class,
+                state: fire.state,
+                confidence: fire.evidence.probability(),
+                first_seen_at: fire.first_seen,
+                captured_at: fire.last_seen,
+                altitude_msl_m: situation.altitude.m(),
+                height_above_ground_m: situation.above_ground.map(HeightAboveGround::m),
+                ce90_m,
+                le90_m: covariance.le90_m(),
+                covariance_enu_m2: covariance.row_major(),
+                methods: fire.methods(),
+                sightings: fire.evidence.hits(),
+                range_m: fire.range_m,
+                size_m: fire.size_m,
+                trend: None,
+                degraded: situation.degraded,
+            },
+        }
+    }
+}

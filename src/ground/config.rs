@@ -1,0 +1,341 @@
+//! The ground station's configuration file: raw TOML to a checked [`GroundConfig`], every problem
+//! at once.
+
+use emberfix_calib::{KeyProblem, unknown_keys};
+use emberfix_mav::{LinkUrl, LinkUrlError};
+use serde::Deserialize;
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+
+/// Why a configuration was refused.
+#[derive(Debug, thiserror::Error)]
+pub enum ConfigError {
+    /// The file can't be read.
+    #[error(
+        "ground configuration {path}: {source}; an example is missions/ground.toml",
+        path = path.display()
+    )]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// Not TOML, or a value of the wrong type.
+    #[error("ground configuration {path}: {message}", path = path.display())]
+    Syntax {
+        /// The file.
+        path: PathBuf,
+        /// What the TOML reader said.
+        message: String,
+    },
+    /// Values that can't be, and keys that nothing reads.
+    #[error("ground configuration {path}: {}", problems.join("; "), path = path.display())]
+    Values {
+        /// The file.
+        path: PathBuf,
+        /// One sentence per problem: key, value, allowed range, remedy.
+        problems: Vec<String>,
+    },
+}
+
+/// What the command line says instead of the file.
+#[derive(Debug, Clone, Default)]
+pub struct Overrides {
+    /// `--listen`: address and port; port 0 takes a free one.
+    pub listen: Option<SocketAddr>,
+    /// `--data`: data directory, relative to the working directory.
+    pub data_dir: Option<PathBuf>,
+    /// `--mavlink`: URL of the MAVLink endpoint.
+    pub mavlink_url: Option<String>,
+}
+
+/// A checked configuration.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct GroundConfig {
+    pub(super) listen: SocketAddr,
+    pub(super) host_names: Vec<String>,
+    pub(super) data_dir: PathBuf,
+    pub(super) mavlink: Option<MavlinkConfig>,
+    pub(super) uavs: Vec<Uav>,
+}
+
+/// The ground agent's end of MAVLink.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct MavlinkConfig {
+    pub url: LinkUrl,
+    pub system_id: u8,
+    pub component_id: u8,
+}
+
+/// Which aircraft flies under which MAVLink system id.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Uav {
+    pub system_id: u8,
+    pub name: String,
+}
+
+#[derive(Deserialize)]
+struct RawConfig {
+    #[serde(default = "default_listen")]
+    listen: String,
+    #[serde(default)]
+    allow_remote: bool,
+    #[serde(default)]
+    host_names: Vec<String>,
+    data_dir: PathBuf,
+    mavlink: Option<RawMavlink>,
+    #[serde(default)]
+    uav: Vec<RawUav>,
+}
+
+#[derive(Deserialize)]
+struct RawMavlink {
+    url: String,
+    #[serde(default = "default_system_id")]
+    system_id: i64,
+    #[serde(default = "default_component_id")]
+    component_id: i64,
+}
+
+#[derive(Deserialize)]
+struct RawUav {
+    system_id: i64,
+    name: String,
+}
+
+fn default_listen() -> String {
+    "127.0.0.1:8470".to_owned()
+}
+/// Ground stations commonly take 255, so our agent beside one takes the next.
+fn default_system_id() -> i64 {
+    254
+}
+/// `MAV_COMP_ID_ONBOARD_COMPUTER`.
+fn default_component_id() -> i64 {
+    191
+}
+
+const KNOWN: &[&str] = &[
+    "listen",
+    "allow_remote",
+    "host_names",
+    "data_dir",
+    "mavlink.url",
+    "mavlink.system_id",
+    "mavlink.component_id",
+    "uav.system_id",
+    "uav.name",
+];
+
+impl GroundConfig {
+    /// Reads and checks a file; `overrides` win. A relative `data_dir` in the file is taken from
+    /// the file's own folder.
+    ///
+    /// # Errors
+    /// [`ConfigError`] with every problem.
+    pub fn load(path: &Path, overrides: Overrides) -> Result<Self, ConfigError> {
+        let text = std::fs::read_to_string(path).map_err(|source| ConfigError::Read {
+            path: path.to_owned(),
+            source,
+        })?;
+        Self::parse(&text, path, overrides)
+    }
+
+    /// Checks the text of the file `path`.
+    ///
+    /// # Errors
+    /// [`ConfigError`] with every problem.
+    pub fn parse(text: &str, path: &Path, overrides: Overrides) -> Result<Self, ConfigError> {
+        let syntax = |error: toml::de::Error| ConfigError::Syntax {
+            path: path.to_owned(),
+            message: error.to_string().trim_end().to_owned(),
+        };
+        let refuse = |problems| {
+            Err(ConfigError::Values {
+                path: path.to_owned(),
+                problems,
+            })
+        };
+        let table: toml::Table = toml::from_str(text).map_err(syntax)?;
+        let mut problems: Vec<String> = unknown_keys(&table, KNOWN)
+            .iter()
+            .map(KeyProblem::to_string)
+            .collect();
+        let raw: RawConfig = match toml::from_str(text) {
+            Ok(raw) => raw,
+            // A misspelt key is also a missing one: name the misspelling, it is what helps.
+            Err(_) if !problems.is_empty() => return refuse(problems),
+            Err(error) => return Err(syntax(error)),
+        };
+        let config = check(raw, path, overrides, &mut problems);
+        match config {
+            Some(config) if problems.is_empty() => Ok(config),
+            _ => refuse(problems),
+        }
+    }
+}
+
+fn check(
+    raw: RawConfig,
+    path: &Path,
+    overrides: Overrides,
+    problems: &mut Vec<String>,
+) -> Option<GroundConfig> {
+    let listen = overrides.listen.or_else(|| address(&raw.listen, problems));
+    if let Some(address) = listen {
+        check_door(address, raw.allow_remote, problems);
+    }
+    let folder = path.parent().unwrap_or(Path::new(""));
+    let mut mavlink = raw.mavlink;
+    if let Some(url) = overrides.mavlink_url {
+        let (system_id, component_id) = mavlink.map_or_else(
+            || (default_system_id(), default_component_id()),
+            |given| (given.system_id, given.component_id),
+        );
+        mavlink = Some(RawMavlink {
+            url,
+            system_id,
+            component_id,
+        });
+    }
+    let mavlink = mavlink.and_then(|link| check_mavlink(link, problems));
+    let uavs = check_uavs(&raw.uav, problems);
+    Some(GroundConfig {
+        listen: listen?,
+        host_names: raw.host_names,
+        data_dir: overrides
+            .data_dir
+            .unwrap_or_else(|| folder.join(raw.data_dir)),
+        mavlink,
+        uavs,
+    })
+}
+
+fn address(text: &str, problems: &mut Vec<String>) -> Option<SocketAddr> {
+    let parsed = text.parse().ok();
+    if parsed.is_none() {
+        problems.push(format!(
+            "listen is {text:?}, allowed is an IP address and a port, such as 127.0.0.1:8470"
+        ));
+    }
+    parsed
+}
+
+/// Whoever reaches the address may post alarms, so by default only this machine may.
+fn check_door(address: SocketAddr, allow_remote: bool, problems: &mut Vec<String>) {
+    if !address.ip().is_loopback() && !allow_remote {
+        problems.push(format!(
+            "listen is {address}, allowed is a loopback address: anyone who reaches it could post \
+             alarms; set allow_remote = true when the network itself is guarded (a VPN)"
+        ));
+    }
+}
+
+fn check_mavlink(raw: RawMavlink, problems: &mut Vec<String>) -> Option<MavlinkConfig> {
+    let system_id = id("mavlink.system_id", raw.system_id, problems);
+    let component_id = id("mavlink.component_id", raw.component_id, problems);
+    let url = raw
+        .url
+        .parse()
+        .map_err(|error: LinkUrlError| problems.push(format!("mavlink.url: {error}")))
+        .ok();
+    Some(MavlinkConfig {
+        url: url?,
+        system_id: system_id?,
+        component_id: component_id?,
+    })
+}
+
+fn id(key: &str, value: i64, problems: &mut Vec<String>) -> Option<u8> {
+    let id = u8::try_from(value).ok().filter(|id| *id > 0);
+    if id.is_none() {
+        problems.push(format!("{key} is {value}, allowed is 1 to 255"));
+    }
+    id
+}
+
+fn check_uavs(raw: &[RawUav], problems: &mut Vec<String>) -> Vec<Uav> {
+    let mut uavs: Vec<Uav> = Vec::new();
+    for uav in raw {
+        let Some(system_id) = id("uav.system_id", uav.system_id, problems) else {
+            continue;
+        };
+        if uav.name.is_empty() || uav.name.len() > 32 {
+            problems.push(format!(
+                "uav.name is {:?}, allowed is 1 to 32 characters",
+                uav.name
+            ));
+        }
+        if uavs
+            .iter()
+            .any(|known| known.system_id == system_id || known.name == uav.name)
+        {
+            problems.push(format!(
+                "uav {:?} with system_id {system_id} repeats a name or a system id",
+                uav.name
+            ));
+        }
+        uavs.push(Uav {
+            system_id,
+            name: uav.name.clone(),
+        });
+    }
+    uavs
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn parse(text: &str) -> Result<GroundConfig, String> {
+        GroundConfig::parse(text, Path::new("conf/ground.toml"), Overrides::default())
+            .map_err(|error| error.to_string())
+    }
+
+    #[test]
+    fn the_example_loads() {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("missions/ground.toml");
+        let config = GroundConfig::load(&path, Overrides::default()).unwrap();
+        assert!(config.listen.ip().is_loopback());
+        assert_eq!(config.mavlink.unwrap().system_id, 254);
+    }
+
+    #[test]
+    fn every_problem_is_named_at_once() {
+        let text = "data_dir='x'\nlisten='0.0.0.0:80'\nlisen=1\n[mavlink]\nurl='udpin:127.0.0.1:1'\n\
+                    system_id=300\n[[uav]]\nsystem_id=0\nname='a'";
+        let message = parse(text).unwrap_err();
+        for part in [
+            "conf/ground.toml",
+            "did you mean listen",
+            "allow_remote = true",
+            "1 to 255",
+            "uav.system_id is 0",
+        ] {
+            assert!(message.contains(part), "{part:?} is not in {message}");
+        }
+    }
+
+    #[test]
+    fn a_data_directory_is_taken_from_the_files_folder_and_an_override_is_not() {
+        assert_eq!(parse("data_dir='d'").unwrap().data_dir, Path::new("conf/d"));
+        let overrides = Overrides {
+            data_dir: Some("e".into()),
+            ..Overrides::default()
+        };
+        let config = GroundConfig::parse("data_dir='d'", Path::new("c/g.toml"), overrides).unwrap();
+        assert_eq!(config.data_dir, Path::new("e"));
+    }
+
+    #[test]
+    fn a_remote_address_needs_to_be_allowed_even_on_the_command_line() {
+        let overrides = Overrides {
+            listen: "[::]:8470".parse().ok(),
+            ..Overrides::default()
+        };
+        let refused = GroundConfig::parse("data_dir='d'", Path::new("g.toml"), overrides);
+        assert!(matches!(refused, Err(ConfigError::Values { .. })));
+        assert!(parse("data_dir='d'\nlisten='0.0.0.0:8470'\nallow_remote=true").is_ok());
+    }
+}

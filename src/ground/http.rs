@@ -1,0 +1,345 @@
+//! The HTTP side: routes, limits, refusals.
+//!
+//! A refusal is JSON, `{"error": ".."}`, with the reason in words. Requests must name the station
+//! by an address, `localhost` or a configured name, and bodies must call themselves JSON: a web
+//! page from elsewhere, open in the duty officer's browser, can neither read nor post alarms.
+
+use super::events::{self, MAX_STREAMS};
+use super::store::{Completeness, Kept, StoreError};
+use super::tracks::Source;
+use super::{Ping, ReceiveError, Station, lock, now};
+use axum::Router;
+use axum::body::Bytes;
+use axum::extract::rejection::BytesRejection;
+use axum::extract::{DefaultBodyLimit, Query, Request, State};
+use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
+use axum::middleware::{self, Next};
+use axum::response::sse::{KeepAlive, Sse};
+use axum::response::{IntoResponse, Response};
+use axum::routing::{get, post};
+use serde::Deserialize;
+use serde_json::json;
+use std::net::IpAddr;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::Duration;
+
+/// Largest body, bytes; an alarm has about one thousand.
+const MAX_BODY: usize = 64 * 1024;
+/// From the end of the head to the head of the answer; a stream's events come after that.
+const MAX_REQUEST_TIME: Duration = Duration::from_secs(10);
+/// Source of alarms as the store names it.
+const LINK_NAME: &str = "http";
+/// Incidents read from the store at once.
+const PAGE: u32 = 512;
+
+type Shared = State<Arc<Station>>;
+
+pub(super) fn router(station: Arc<Station>, host_names: Arc<[String]>) -> Router {
+    Router::new()
+        .route(
+            "/",
+            get(|| page("text/html; charset=utf-8", include_str!("page/index.html"))),
+        )
+        .route(
+            "/app.js",
+            get(|| {
+                page(
+                    "text/javascript; charset=utf-8",
+                    include_str!("page/app.js"),
+                )
+            }),
+        )
+        .route(
+            "/style.css",
+            get(|| page("text/css; charset=utf-8", include_str!("page/style.css"))),
+        )
+        .route("/alarms", post(post_alarm))
+        .route("/alarms.geojson", get(alarms))
+        .route("/track", post(post_track))
+        .route("/track.geojson", get(tracks))
+        .route("/events", get(event_stream))
+        .route("/health", get(health))
+        .fallback(|| async { refusal(StatusCode::NOT_FOUND, "nothing lives here; see /") })
+        .with_state(station)
+        .layer(DefaultBodyLimit::max(MAX_BODY))
+        .layer(middleware::from_fn(in_time))
+        .layer(middleware::from_fn_with_state(host_names, only_for_us))
+        .layer(middleware::map_response(guarded))
+}
+
+async fn page(kind: &'static str, text: &'static str) -> impl IntoResponse {
+    ([(header::CONTENT_TYPE, kind)], text)
+}
+
+fn refusal(status: StatusCode, reason: impl std::fmt::Display) -> Response {
+    (status, axum::Json(json!({ "error": reason.to_string() }))).into_response()
+}
+
+/// A handler that has not answered in time is dropped.
+async fn in_time(request: Request, next: Next) -> Response {
+    tokio::time::timeout(MAX_REQUEST_TIME, next.run(request))
+        .await
+        .unwrap_or_else(|_| {
+            let reason = format!(
+                "no complete request within {} s",
+                MAX_REQUEST_TIME.as_secs()
+            );
+            refusal(StatusCode::REQUEST_TIMEOUT, reason)
+        })
+}
+
+/// Refuses requests for a host that we are not: a foreign name that was made to point here.
+async fn only_for_us(
+    State(host_names): State<Arc<[String]>>,
+    request: Request,
+    next: Next,
+) -> Response {
+    let host = request
+        .headers()
+        .get(header::HOST)
+        .and_then(|host| host.to_str().ok());
+    match host {
+        Some(host) if is_ours(host, &host_names) => next.run(request).await,
+        _ => refusal(
+            StatusCode::MISDIRECTED_REQUEST,
+            "this host name is not ours; add it to host_names in the ground configuration",
+        ),
+    }
+}
+
+fn is_ours(host: &str, host_names: &[String]) -> bool {
+    let port = host
+        .rfind(':')
+        .filter(|colon| !host[*colon..].contains(']'));
+    let name = port
+        .map_or(host, |colon| &host[..colon])
+        .trim_matches(['[', ']']);
+    name.parse::<IpAddr>().is_ok()
+        || name.eq_ignore_ascii_case("localhost")
+        || host_names
+            .iter()
+            .any(|ours| ours.eq_ignore_ascii_case(name))
+}
+
+/// The page loads nothing from elsewhere and sits in no one's frame; the browser is told so.
+async fn guarded(mut response: Response) -> Response {
+    const HEADERS: [(HeaderName, &str); 4] = [
+        (
+            header::CONTENT_SECURITY_POLICY,
+            "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; \
+             img-src 'self' data:; frame-ancestors 'none'; base-uri 'none'; form-action 'none'",
+        ),
+        (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
+        (header::REFERRER_POLICY, "no-referrer"),
+        (header::CACHE_CONTROL, "no-cache"),
+    ];
+    for (name, value) in HEADERS {
+        response
+            .headers_mut()
+            .insert(name, HeaderValue::from_static(value));
+    }
+    response
+}
+
+/// Why a body was not read.
+#[derive(Debug, thiserror::Error)]
+enum BodyError {
+    #[error("Content-Type is {kind:?}, allowed are application/json and application/geo+json")]
+    Kind { kind: String },
+    #[error("the body is larger than {MAX_BODY} bytes")]
+    Large,
+    #[error("the body did not come: {source}")]
+    Broken { source: BytesRejection },
+}
+
+impl BodyError {
+    fn answer(&self) -> Response {
+        let status = match self {
+            Self::Kind { .. } => StatusCode::UNSUPPORTED_MEDIA_TYPE,
+            Self::Large => StatusCode::PAYLOAD_TOO_LARGE,
+            Self::Broken { source } => source.status(),
+        };
+        refusal(status, self)
+    }
+}
+
+/// The body, if it is small enough and calls itself JSON.
+fn json_body(headers: &HeaderMap, body: Result<Bytes, BytesRejection>) -> Result<Bytes, BodyError> {
+    let kind = headers
+        .get(header::CONTENT_TYPE)
+        .and_then(|kind| kind.to_str().ok());
+    let kind = kind
+        .unwrap_or_default()
+        .split(';')
+        .next()
+        .unwrap_or_default()
+        .trim();
+    if !["application/json", "application/geo+json"].contains(&kind) {
+        return Err(BodyError::Kind {
+            kind: kind.to_owned(),
+        });
+    }
+    body.map_err(|source| match source.status() {
+        StatusCode::PAYLOAD_TOO_LARGE => BodyError::Large,
+        _ => BodyError::Broken { source },
+    })
+}
+
+async fn post_alarm(
+    State(station): Shared,
+    headers: HeaderMap,
+    body: Result<Bytes, BytesRejection>,
+) -> Response {
+    let body = match json_body(&headers, body) {
+        Ok(body) => body,
+        Err(error) => {
+            station.refuse(&error, LINK_NAME);
+            return error.answer();
+        }
+    };
+    let (alarm, kept) = match station.receive(&body, LINK_NAME, Completeness::Full).await {
+        Ok(received) => received,
+        Err(error) => return not_taken(&error),
+    };
+    let status = match kept {
+        Kept::New { .. } => StatusCode::CREATED,
+        Kept::Again => StatusCode::OK,
+    };
+    let properties = alarm.properties;
+    let receipt = json!({ "id": properties.id, "revision": properties.revision, "stored": true });
+    (status, axum::Json(receipt)).into_response()
+}
+
+fn not_taken(error: &ReceiveError) -> Response {
+    let status = match error {
+        ReceiveError::Alarm(_) | ReceiveError::Covariance { .. } => StatusCode::BAD_REQUEST,
+        ReceiveError::Store(StoreError::Conflict { .. }) => StatusCode::CONFLICT,
+        ReceiveError::Store(_) => StatusCode::SERVICE_UNAVAILABLE,
+    };
+    refusal(status, error)
+}
+
+async fn post_track(
+    State(station): Shared,
+    headers: HeaderMap,
+    body: Result<Bytes, BytesRejection>,
+) -> Response {
+    let body = match json_body(&headers, body) {
+        Ok(body) => body,
+        Err(error) => return error.answer(),
+    };
+    match Ping::from_json(&body).and_then(|ping| station.moved(ping, Source::Service)) {
+        Ok(()) => StatusCode::NO_CONTENT.into_response(),
+        Err(error) => refusal(StatusCode::BAD_REQUEST, error),
+    }
+}
+
+async fn alarms(State(station): Shared) -> Response {
+    let features = station
+        .with_store(|store| {
+            let mut features: Vec<String> = Vec::new();
+            let mut after = 0;
+            loop {
+                let page = store.incidents_after(after, PAGE)?;
+                let Some(last) = page.last() else {
+                    return Ok(features);
+                };
+                after = last.row;
+                features.extend(page.into_iter().map(|row| row.feature));
+            }
+        })
+        .await;
+    match features {
+        Ok(features) => geojson(format!(
+            "{{\"type\":\"FeatureCollection\",\"features\":[{}]}}",
+            features.join(",\n")
+        )),
+        Err(error) => refusal(StatusCode::SERVICE_UNAVAILABLE, error),
+    }
+}
+
+async fn tracks(State(station): Shared) -> Response {
+    let tracks = station.tracks().to_geojson();
+    geojson(tracks.to_string())
+}
+
+fn geojson(text: String) -> Response {
+    ([(header::CONTENT_TYPE, "application/geo+json")], text).into_response()
+}
+
+#[derive(Deserialize)]
+struct Resume {
+    /// For clients that can't set the header.
+    last_event_id: Option<i64>,
+}
+
+async fn event_stream(
+    State(station): Shared,
+    headers: HeaderMap,
+    Query(resume): Query<Resume>,
+) -> Response {
+    let header = headers.get("last-event-id").and_then(|id| id.to_str().ok());
+    let last = header
+        .and_then(|id| id.trim().parse().ok())
+        .or(resume.last_event_id);
+    match events::open(&station, last) {
+        Some(events) => Sse::new(events)
+            .keep_alive(KeepAlive::default())
+            .into_response(),
+        None => refusal(
+            StatusCode::SERVICE_UNAVAILABLE,
+            format!("there are {MAX_STREAMS} event streams already"),
+        ),
+    }
+}
+
+async fn health(State(station): Shared) -> Response {
+    let census = match station.with_store(|store| store.census()).await {
+        Ok(census) => census,
+        Err(error) => return refusal(StatusCode::SERVICE_UNAVAILABLE, error),
+    };
+    let counters = &station.counters;
+    let aircraft: Vec<_> = station.tracks().latest().cloned().collect();
+    let mavlink = lock(&station.mavlink).clone();
+    axum::Json(json!({
+        "status": "ok",
+        "version": env!("CARGO_PKG_VERSION"),
+        "now": now().rfc3339(),
+        "store": station.store.id(),
+        "incidents": census.incidents,
+        "alarms": census.alarms,
+        "since_start": {
+            "stored": counters.stored.load(Ordering::Relaxed),
+            "repeated": counters.repeated.load(Ordering::Relaxed),
+            "refused": counters.refused.load(Ordering::Relaxed),
+        },
+        "streams": counters.streams.load(Ordering::Relaxed),
+        "mavlink": mavlink,
+        "aircraft": aircraft,
+    }))
+    .into_response()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::is_ours;
+
+    #[test]
+    fn addresses_and_configured_names_are_ours_and_a_rebound_name_is_not() {
+        let names = ["ground.example".to_owned()];
+        for host in [
+            "127.0.0.1:8470",
+            "[::1]:8470",
+            "[::1]",
+            "localhost",
+            "Ground.example:80",
+            "10.0.0.7",
+        ] {
+            assert!(is_ours(host, &names), "{host}");
+        }
+        for host in ["evil.example", "127.0.0.1.evil.example:8470", ""] {
+            assert!(!is_ours(host, &names), "{host}");
+        }
+    }
+}

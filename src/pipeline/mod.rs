@@ -1,0 +1,363 @@
+//! The one loop over a closed set of events: telemetry and pairs in, fixes and alarms out.
+//!
+//! **In:** [`Event`]s in the order in which they reached the service, each with its arrival.
+//! **Out:** [`Output`]s for the recording, the outbox and the links. The loop reads no clock and
+//! does no I/O: the same events give the same outputs, live or from a recording. What a live run
+//! drops (pairs that a newer one replaced) never becomes an event, so a recording of the events
+//! replays to the same alarms.
+//!
+//! **Bound.** One pair waits for the telemetry that follows its shutter; a newer one replaces it,
+//! and that is counted.
+
+mod counters;
+mod feature;
+mod vision;
+
+pub use counters::Counters;
+pub use vision::{Seen, Vision};
+
+use crate::alarm::{Alarm, AlarmDesk, FireId, Situation};
+use crate::detect::{Detection, Detector};
+use crate::ingest::StereoPair;
+use crate::locate::{SharedSigmas, Terrain, View};
+use crate::mission::Mission;
+use crate::pose::{Pose, PoseAnswer, PoseEstimator};
+use crate::range::Ranger;
+use crate::track::{Fire, Outcome, Tracker};
+use emberfix_calib::Rig;
+use emberfix_frames::{
+    ServiceTime, SignedDuration, Stamped, TimeSyncSample, Wgs84, Wgs84Parts, ecef_from_enu, place_from_ecef,
+    seconds,
+};
+use emberfix_mav::telemetry::{GpsRaw, TimeSyncMessage};
+use emberfix_mav::{Address, Received, SystemId, Telemetry};
+use std::sync::Arc;
+
+/// One thing that reached the service.
+#[derive(Debug)]
+pub enum Event {
+    /// A MAVLink frame and what it says.
+    Mavlink(Box<Received>),
+    /// A stereo pair.
+    Pair(Box<Stamped<StereoPair>>),
+}
+
+/// One thing that the service found out.
+#[derive(Debug, Clone)]
+pub enum Output {
+    /// Where the vehicle was at a shutter time.
+    Pose(Box<Pose>),
+    /// What the detector found in one pair.
+    Detections {
+        /// Mid-exposure.
+        at: ServiceTime,
+        /// What, in pixels of the raw left image.
+        found: Vec<Detection>,
+    },
+    /// One sighting, as a GeoJSON Feature.
+    Fix {
+        /// Mid-exposure.
+        at: ServiceTime,
+        /// The Feature.
+        feature: serde_json::Value,
+    },
+    /// An alarm to be told.
+    Alarm(Box<Alarm>),
+}
+
+/// Whether the pipeline does its work, and why not.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Health {
+    /// What is wrong, in words; empty when all is well.
+    pub problems: Vec<String>,
+}
+
+/// The loop's state.
+pub struct Pipeline {
+    rig: Arc<Rig>,
+    datum: Wgs84,
+    terrain: Option<Arc<dyn Terrain>>,
+    shared: SharedSigmas,
+    vision: Vision,
+    poses: PoseEstimator,
+    tracker: Tracker,
+    desk: AlarmDesk,
+    autopilot: AutopilotLock,
+    waiting: Option<Box<Stamped<StereoPair>>>,
+    last_pair_at: Option<ServiceTime>,
+    last_look: Option<ServiceTime>,
+    last_position: Option<ServiceTime>,
+    no_pose: Option<String>,
+    now: ServiceTime,
+    counters: Counters,
+    degraded: Vec<&'static str>,
+}
+
+/// The vehicle whose telemetry counts: configured, or the first autopilot that is heard. Others
+/// are counted and never mixed in.
+#[derive(Debug, Clone, Copy)]
+struct AutopilotLock {
+    system: Option<SystemId>,
+}
+
+/// A pair or a position older than this makes the pipeline unhealthy.
+const SILENCE: SignedDuration = SignedDuration::from_secs(3);
+
+impl Pipeline {
+    /// A loop for a mission; fires are numbered from `first_fire`.
+    #[must_use]
+    pub fn new(
+        mission: &Mission,
+        detector: Box<dyn Detector>,
+        ranger: Box<dyn Ranger>,
+        first_fire: FireId,
+    ) -> Self {
+        let system = (mission.system_id != 0).then_some(SystemId(mission.system_id));
+        Self {
+            rig: Arc::clone(&mission.rig),
+            datum: mission.datum,
+            terrain: mission.terrain.clone(),
+            shared: mission.shared,
+            vision: Vision::new(&mission.rig, detector, ranger),
+            poses: PoseEstimator::new(mission.pose),
+            tracker: Tracker::new(mission.track, first_fire),
+            desk: AlarmDesk::new(mission.uav.clone()),
+            autopilot: AutopilotLock { system },
+            waiting: None,
+            last_pair_at: None,
+            last_look: None,
+            last_position: None,
+            no_pose: None,
+            now: ServiceTime::from_unix_ns(0),
+            counters: Counters::default(),
+            degraded: Vec::new(),
+        }
+    }
+
+    /// Takes one event in. Arrivals never run backwards: an earlier one counts as now.
+    pub fn handle(&mut self, arrived: ServiceTime, event: Event) -> Vec<Output> {
+        self.now = self.now.max(arrived);
+        match event {
+            Event::Mavlink(received) => self.take_mavlink(&received),
+            Event::Pair(pair) => self.take_pair(pair),
+        }
+        self.work_off()
+    }
+
+    /// The vehicle that is listened to, once known.
+    #[must_use]
+    pub fn vehicle(&self) -> Option<SystemId> {
+        self.autopilot.system
+    }
+
+    /// Everything that was counted: used, refused and lost, by name.
+    #[must_use]
+    pub fn counters(&self) -> &Counters {
+        &self.counters
+    }
+
+    /// All fires.
+    #[must_use]
+    pub fn fires(&self) -> &[Fire] {
+        self.tracker.fires()
+    }
+
+    /// Latest arrival that was taken in.
+    #[must_use]
+    pub fn now(&self) -> ServiceTime {
+        self.now
+    }
+
+    /// What is wrong at the moment `now`.
+    #[must_use]
+    pub fn health(&self, now: ServiceTime) -> Health {
+        let silent = |last: Option<ServiceTime>| last.is_none_or(|last| now - last > SILENCE);
+        let mut problems = Vec::new();
+        if silent(self.last_position) {
+            problems.push("no position from the autopilot".to_owned());
+        }
+        if silent(self.last_look) {
+            problems.push("no stereo pairs".to_owned());
+        }
+        problems.extend(self.no_pose.clone());
+        Health { problems }
+    }
+
+    fn take_mavlink(&mut self, received: &Received) {
+        let telemetry = match &received.telemetry {
+            Ok(telemetry) => telemetry,
+            Err(error) => {
+                self.counters.add("mavlink_refused", error.name());
+                return;
+            }
+        };
+        if let Telemetry::TimeSync(sync) = telemetry {
+            self.take_timesync(received.frame.sender(), sync);
+            return;
+        }
+        if let Telemetry::Heartbeat(heartbeat) = telemetry
+            && heartbeat.is_autopilot()
+            && self.autopilot.system.is_none()
+        {
+            self.autopilot.system = Some(received.system());
+        }
+        if !self.autopilot.is(received.frame.sender()) {
+            self.counters.add("mavlink", "other_sender");
+            return;
+        }
+        self.take_telemetry(telemetry);
+    }
+
+    fn take_telemetry(&mut self, telemetry: &Telemetry) {
+        match telemetry {
+            Telemetry::Attitude(sample) => {
+                self.poses.add_attitude(sample.boot, self.now, sample.attitude, sample.rate_rad_s);
+                self.counters.add("telemetry", "attitude");
+            }
+            Telemetry::GlobalPosition(position) => {
+                let degrees = (position.latitude_deg, position.longitude_deg);
+                let velocity = position.velocity_ned_m_s;
+                self.poses.add_position(position.boot, self.now, degrees, position.altitude, velocity);
+                self.last_position = Some(self.now);
+                self.counters.add("telemetry", "position");
+            }
+            Telemetry::GpsRaw(raw) => self.take_gnss(raw),
+            Telemetry::SystemTime(time) if time.utc_is_absurd() => {
+                self.counters.add("mavlink_refused", "absurd_utc");
+            }
+            _ => {}
+        }
+    }
+
+    fn take_gnss(&mut self, raw: &GpsRaw) {
+        let separation =
+            raw.place.and_then(|place| place.height.map(|height| height - place.altitude));
+        let sigmas = (raw.horizontal_sigma_m, raw.vertical_sigma_m);
+        self.poses.add_gnss(self.now, raw.fix.is_3d(), sigmas, separation);
+        self.counters.add("telemetry", if raw.fix.is_3d() { "gnss_3d" } else { "gnss_no_3d" });
+    }
+
+    /// Replies carry our own clock in `ts1`; a live service filters those that it never asked for
+    /// before they become events, a replay takes them all.
+    fn take_timesync(&mut self, sender: Address, sync: &TimeSyncMessage) {
+        if sync.is_request() || !self.autopilot.is(sender) {
+            return;
+        }
+        let taken = self.poses.add_timesync(TimeSyncSample {
+            asked: ServiceTime::from_unix_ns(sync.ts1_ns),
+            remote: emberfix_frames::BootTime::from_ns(sync.tc1_ns),
+            answered: self.now,
+        });
+        self.counters.add("timesync", if taken { "taken" } else { "refused" });
+    }
+
+    fn take_pair(&mut self, pair: Box<Stamped<StereoPair>>) {
+        if self.last_pair_at.is_some_and(|last| pair.at <= last) {
+            self.counters.add("pairs", "not_later");
+            return;
+        }
+        self.last_pair_at = Some(pair.at);
+        self.last_look = Some(self.now);
+        if self.waiting.replace(pair).is_some() {
+            self.counters.add("pairs", "replaced_while_waiting");
+        }
+    }
+
+    fn work_off(&mut self) -> Vec<Output> {
+        let Some(pair) = self.waiting.take() else {
+            return Vec::new();
+        };
+        let moment = pair.at + seconds(self.rig.time_offset_s());
+        match self.poses.at(moment, self.now) {
+            PoseAnswer::NotYet => {
+                self.waiting = Some(pair);
+                Vec::new()
+            }
+            PoseAnswer::Fresh(pose) => {
+                self.no_pose = None;
+                self.look(&pair, &pose)
+            }
+            PoseAnswer::NeverSeen { what } => self.without_pose("pose_never_seen", || {
+                format!("no {what} has come from the autopilot")
+            }),
+            PoseAnswer::Stale { what, nearest, limit } => self.without_pose("pose_stale", || {
+                format!("{what} is {nearest:#} away from the shutter, limit {limit:#}")
+            }),
+            PoseAnswer::NoGnssFix => {
+                self.without_pose("no_gnss_fix", || "GNSS has no 3D fix: no positions".to_owned())
+            }
+        }
+    }
+
+    fn without_pose(&mut self, why: &'static str, words: impl FnOnce() -> String) -> Vec<Output> {
+        self.counters.add("pairs_without_pose", why);
+        self.no_pose = Some(words());
+        Vec::new()
+    }
+
+    fn look(&mut self, pair: &Stamped<StereoPair>, pose: &Pose) -> Vec<Output> {
+        let Some(seen) = self.vision.look(pair, &mut self.counters) else {
+            return Vec::new();
+        };
+        let rig = Arc::clone(&self.rig);
+        let view = View::new(&rig, pose, &self.shared, &self.datum);
+        self.degraded = pose.degraded.iter().map(|reason| reason.name()).collect();
+        if seen.mono {
+            self.degraded.push(crate::pose::Degraded::Mono.name());
+        }
+        let terrain = self.terrain.clone();
+        let sightings: Vec<_> = seen.sightings.iter().map(|(_, sighting)| *sighting).collect();
+        let outcomes = self.tracker.step(&view, &sightings, terrain.as_deref());
+        let mut outputs = vec![Output::Pose(Box::new(pose.clone()))];
+        for outcome in &outcomes {
+            outputs.push(self.fix_output(&seen, outcome, &view));
+        }
+        outputs.push(Output::Detections { at: pair.at, found: seen.found });
+        outputs.extend(self.alarms());
+        outputs
+    }
+
+    fn fix_output(&mut self, seen: &Seen, outcome: &Outcome, view: &View<'_>) -> Output {
+        let (found, classified) = &seen.sightings[outcome.index];
+        let at = classified.sighting.at;
+        let situation = outcome.fix.as_ref().map(|fix| {
+            let mut situation = situate(&fix.place, &mut self.poses, self.terrain.as_deref());
+            situation.degraded = self.degraded.iter().map(|reason| (*reason).to_owned()).collect();
+            situation
+        });
+        let box_px = seen.found[*found].box_px;
+        let feature = feature::sighting(classified, outcome, box_px, situation.as_ref(), view);
+        Output::Fix { at, feature: self.desk.signed(outcome.fire, feature) }
+    }
+
+    fn alarms(&mut self) -> Vec<Output> {
+        let (datum, terrain) = (self.datum, self.terrain.clone());
+        let (poses, degraded) = (&mut self.poses, &self.degraded);
+        let due = self.desk.due(self.tracker.fires(), |fire| {
+            let place = place_from_ecef(&ecef_from_enu(&datum).transform(fire.position()))?;
+            let mut situation = situate(&place, poses, terrain.as_deref());
+            situation.degraded = degraded.iter().map(|reason| (*reason).to_owned()).collect();
+            situation.degraded.extend(fire.merged_into.map(|into| format!("merged_into_{}", into.0)));
+            Some(situation)
+        });
+        due.into_iter().map(|alarm| Output::Alarm(Box::new(alarm))).collect()
+    }
+}
+
+impl AutopilotLock {
+    fn is(self, sender: Address) -> bool {
+        self.system == Some(sender.system)
+            && sender.component == emberfix_mav::ComponentId::AUTOPILOT
+    }
+}
+
+/// Altitude and height above ground of a place.
+fn situate(place: &Wgs84, poses: &mut PoseEstimator, terrain: Option<&dyn Terrain>) -> Situation {
+    let ground = terrain.and_then(|terrain| terrain.height_at(place));
+    Situation {
+        place: *place,
+        altitude: place.height() - poses.undulation(place),
+        above_ground: ground.map(|ground| place.height() - ground),
+        degraded: Vec::new(),
+    }
+}

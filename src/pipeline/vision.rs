@@ -1,0 +1,187 @@
+//! One pair to sightings: decode, judge the eyes, detect, range.
+
+use super::Counters;
+use crate::alarm::AlarmClass;
+use crate::detect::{BoxPx, Detection, DetectionClass, Detector, LeftImage};
+use crate::ingest::{EncodedImage, EyeHealth, EyeWatch, ImageDecoder, StereoPair};
+use crate::locate::{DisparityOf, Sighting};
+use crate::range::{Ranger, Ranging, RawPair, Target};
+use crate::track::Classified;
+use emberfix_calib::{Eye, RawPixel, RectifiedPixel, Rig};
+use emberfix_frames::Stamped;
+use opencv::core::Mat;
+use std::sync::Arc;
+
+/// What one pair showed.
+#[derive(Debug, Clone)]
+pub struct Seen {
+    /// All detections.
+    pub found: Vec<Detection>,
+    /// Those that may become fires, each with its index in `found`.
+    pub sightings: Vec<(usize, Classified)>,
+    /// True when the right eye was of no use.
+    pub mono: bool,
+}
+
+/// Decoder, detector and ranger of one rig.
+pub struct Vision {
+    rig: Arc<Rig>,
+    decoder: ImageDecoder,
+    left_watch: EyeWatch,
+    right_watch: EyeWatch,
+    detector: Box<dyn Detector>,
+    ranger: Box<dyn Ranger>,
+}
+
+/// Jitter of a box's edges: pixels at least, and as a share of the box.
+const EDGE_PX: f64 = 2.0;
+const EDGE_SHARE: f64 = 0.1;
+
+impl Vision {
+    /// For one rig.
+    #[must_use]
+    pub fn new(rig: &Arc<Rig>, detector: Box<dyn Detector>, ranger: Box<dyn Ranger>) -> Self {
+        Self {
+            rig: Arc::clone(rig),
+            decoder: ImageDecoder::new(rig),
+            left_watch: EyeWatch::default(),
+            right_watch: EyeWatch::default(),
+            detector,
+            ranger,
+        }
+    }
+
+    /// Looks at a pair. `None` when the left eye shows nothing that can be trusted; why is counted.
+    pub fn look(&mut self, pair: &Stamped<StereoPair>, counters: &mut Counters) -> Option<Seen> {
+        let bgr = self.left(&pair.value.left, counters)?;
+        let image = LeftImage { at: pair.at, sequence: pair.value.sequence, bgr };
+        let found = match self.detector.detect(&image) {
+            Ok(found) => found,
+            Err(error) => {
+                counters.add("detector", error.name());
+                tracing::warn!(%error, "frame not used");
+                return None;
+            }
+        };
+        counters.add("pairs", "looked_at");
+        let right_gray = self.right(pair.value.right.as_ref(), counters);
+        let raw = RawPair { at: pair.at, left_bgr: image.bgr, right_gray };
+        let mut sightings = Vec::new();
+        for (index, detection) in found.iter().enumerate() {
+            if let Some(classified) = self.sighting(&raw, detection, counters) {
+                sightings.push((index, classified));
+            }
+        }
+        Some(Seen { found, sightings, mono: raw.right_gray.is_none() })
+    }
+
+    fn left(&mut self, image: &EncodedImage, counters: &mut Counters) -> Option<Mat> {
+        let bgr = match self.decoder.left(image) {
+            Ok(bgr) => bgr,
+            Err(error) => {
+                counters.add("left_eye", "undecodable");
+                tracing::warn!(%error, "left image not used");
+                return None;
+            }
+        };
+        is_usable(&mut self.left_watch, image, &bgr, "left_eye", counters).then_some(bgr)
+    }
+
+    fn right(&mut self, image: Option<&EncodedImage>, counters: &mut Counters) -> Option<Mat> {
+        let Some(image) = image else {
+            counters.add("right_eye", "missing");
+            return None;
+        };
+        let gray = match self.decoder.right(image) {
+            Ok(gray) => gray,
+            Err(error) => {
+                counters.add("right_eye", "undecodable");
+                tracing::warn!(%error, "right image not used");
+                return None;
+            }
+        };
+        is_usable(&mut self.right_watch, image, &gray, "right_eye", counters).then_some(gray)
+    }
+
+    fn sighting(
+        &mut self,
+        pair: &RawPair,
+        detection: &Detection,
+        counters: &mut Counters,
+    ) -> Option<Classified> {
+        let class = match detection.class {
+            DetectionClass::Fire => AlarmClass::Fire,
+            DetectionClass::Smoke => AlarmClass::Smoke,
+            DetectionClass::NonFire => return None,
+        };
+        let target = Target { class: detection.class, box_px: detection.box_px };
+        let ranging = match self.ranger.range(pair, &target) {
+            Ok(ranging) => ranging,
+            Err(error) => {
+                counters.add("range", "failed");
+                tracing::warn!(%error, "no stereo for this box");
+                Ranging::NoMatch
+            }
+        };
+        counters.add("range", name_of(&ranging));
+        let sighting = self.place_in_rectified(pair, &detection.box_px, &ranging)?;
+        Some(Classified { sighting, class, score: detection.score })
+    }
+
+    fn place_in_rectified(
+        &self,
+        pair: &RawPair,
+        box_px: &BoxPx,
+        ranging: &Ranging,
+    ) -> Option<Sighting> {
+        let (u, v) = box_px.base();
+        let rectification = self.rig.rectification();
+        let base: RectifiedPixel =
+            *rectification.rectify(Eye::Left, &[RawPixel { u, v }]).ok()?.first()?;
+        let camera = self.rig.camera(Eye::Left);
+        let scale =
+            (rectification.focal_px() / camera.focal_px.0, rectification.focal_px() / camera.focal_px.1);
+        let size_px = (box_px.width * scale.0, box_px.height * scale.1);
+        let (disparity, at_least_m) = match *ranging {
+            Ranging::Measured { disparity_px, sigma_px, centroid, .. } => {
+                (Some(DisparityOf { px: disparity_px, sigma_px, centroid }), None)
+            }
+            Ranging::BeyondReach { at_least_m } => (None, Some(at_least_m)),
+            Ranging::NoMatch => (None, None),
+        };
+        Some(Sighting {
+            at: pair.at,
+            base,
+            base_sigma_px: (EDGE_PX.max(EDGE_SHARE * size_px.0), EDGE_PX.max(EDGE_SHARE * size_px.1)),
+            size_px,
+            disparity,
+            at_least_m,
+        })
+    }
+}
+
+fn name_of(ranging: &Ranging) -> &'static str {
+    match ranging {
+        Ranging::Measured { .. } => "measured",
+        Ranging::BeyondReach { .. } => "beyond_reach",
+        Ranging::NoMatch => "no_match",
+    }
+}
+
+fn is_usable(
+    watch: &mut EyeWatch,
+    image: &EncodedImage,
+    pixels: &Mat,
+    eye: &'static str,
+    counters: &mut Counters,
+) -> bool {
+    let fault = match watch.check(image, pixels) {
+        Ok(EyeHealth::Good) => return true,
+        Ok(EyeHealth::Black { .. }) => "black",
+        Ok(EyeHealth::Saturated { .. }) => "saturated",
+        Ok(EyeHealth::Frozen { .. }) => "frozen",
+        Err(_) => "unreadable",
+    };
+    counters.add(eye, fault);
+    false
+}

@@ -1,0 +1,80 @@
+//! JSON schemas of the topics that are not Foxglove's.
+
+/// `/fire/alarms`: the contract's alarm.
+pub(super) const ALARM: &str = r#"{
+  "$schema": "https://json-schema.org/draft/2020-12/schema",
+  "title": "emberfix.Alarm",
+  "description": "One revision of one fire's alarm: a GeoJSON Feature at the base of the fire",
+  "type": "object",
+  "required": ["type", "geometry", "properties"],
+  "properties": {
+    "type": {"const": "Feature"},
+    "geometry": {
+      "type": "object",
+      "required": ["type", "coordinates"],
+      "properties": {
+        "type": {"const": "Point"},
+        "coordinates": {
+          "description": "longitude deg, latitude deg, ellipsoid height m",
+          "type": "array", "minItems": 3, "maxItems": 3, "items": {"type": "number"}
+        }
+      }
+    },
+    "properties": {
+      "type": "object",
+      "required": ["id", "revision", "uav", "class", "state", "confidence", "first_seen_at",
+        "captured_at", "altitude_msl_m", "height_above_ground_m", "ce90_m", "le90_m",
+        "covariance_enu_m2", "methods", "sightings", "range_m", "size_m", "trend", "degraded"],
+      "properties": {
+        "id": {"type": "string", "minLength": 1, "maxLength": 64},
+        "revision": {"type": "integer", "minimum": 1},
+        "uav": {"type": "string"},
+        "class": {"enum": ["fire", "smoke"]},
+        "state": {"enum": ["suspected", "confirmed", "growing", "steady", "dying", "out"]},
+        "confidence": {"type": "number", "minimum": 0, "maximum": 1},
+        "first_seen_at": {"type": "string", "format": "date-time"},
+        "captured_at": {"type": "string", "format": "date-time"},
+        "altitude_msl_m": {"type": "number"},
+        "height_above_ground_m": {"type": ["number", "null"]},
+        "ce90_m": {"type": "number", "minimum": 0},
+        "le90_m": {"type": "number", "minimum": 0},
+        "covariance_enu_m2": {
+          "type": "array", "minItems": 9, "maxItems": 9, "items": {"type": "number"}
+        },
+        "methods": {"type": "array", "items": {"enum": ["stereo", "parallax", "terrain"]}},
+        "sightings": {"type": "integer", "minimum": 0},
+        "range_m": {"type": "number", "minimum": 0},
+        "size_m": {
+          "type": ["object", "null"],
+          "required": ["width", "height"],
+          "properties": {"width": {"type": "number"}, "height": {"type": "number"}}
+        },
+        "trend": {"type": ["number", "null"]},
+        "degraded": {"type": "array", "items": {"type": "string"}}
+      }
+    }
+  }
+}"#;
+
+/// `/fire/fixes`: one sighting with its position, as far as it has the alarm's properties.
+pub(super) const FIX: &str = r#"{
+  "$schema": "https://json-schema.org/draft/2020-12/schema",
+  "title": "emberfix.Fix",
+  "description": "One sighting: a GeoJSON Feature; properties are the alarm's as far as one sighting has them",
+  "type": "object",
+  "required": ["type", "geometry", "properties"],
+  "properties": {
+    "type": {"const": "Feature"},
+    "geometry": {"type": ["object", "null"]},
+    "properties": {
+      "type": "object",
+      "properties": {
+        "fire": {"description": "number of the fire", "type": ["integer", "string", "null"]},
+        "box_px": {
+          "description": "x, y, width, height in the raw left image",
+          "type": "array", "minItems": 4, "maxItems": 4, "items": {"type": "number"}
+        }
+      }
+    }
+  }
+}"#;
