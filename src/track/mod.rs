@@ -4,20 +4,22 @@
 //! the plane at the mission datum, each with the covariance of all of its error. Pure: no I/O, no
 //! clock.
 //!
-//! **Estimation.** Bearing, disparity and terrain are fused always and switched never, by a
-//! Schmidt-Kalman filter per fire: GNSS offset, heading, tilt and boresight, disparity offset and
-//! clock offset are *considered*, with their correlation to the fire kept, so that they never
-//! average out as if they were noise. The terrain's own error is a state of each fire, so that
-//! looking twice at the same ground does not make it better known. Cost is linear in fires.
+//! **Estimation.** Bearing, disparity and terrain are fused always and switched never. GNSS offset,
+//! heading, tilt and boresight, disparity offset and clock offset are states that all fires share
+//! ([`SharedEstimate`]): what the sightings say about them is learned, what they can't say (a GNSS
+//! offset without a landmark) stays in every ellipse, and nothing averages out as if it were noise.
+//! The terrain's own error is a state of each fire, so that looking twice at the same ground does
+//! not make it better known. Cost is linear in fires ([`Estimate`] says how).
 //!
-//! **Known limits.** The shared errors are considered, not yet estimated; a fire is a point with a
-//! size, not an area.
+//! **Known limits.** A fire is a point with a size, not an area.
 
 mod estimate;
 mod life;
+mod shared;
 
 pub use estimate::Estimate;
 pub use life::Evidence;
+pub use shared::{Passage, SharedEstimate};
 
 use crate::alarm::{AlarmClass, FireId, FireState, Method, SizeM};
 use crate::locate::{Fix, Sighting, Terrain, View, fix};
@@ -46,6 +48,8 @@ pub struct TrackConfig {
     pub gnss_correlation_s: f64,
     /// Seconds after which heading error has become another one.
     pub heading_correlation_s: f64,
+    /// Seconds after which boresight, disparity and clock errors have become other ones.
+    pub mount_correlation_s: f64,
     /// Seconds without a sighting after which a suspected fire is forgotten.
     pub forget_suspected_s: f64,
 }
@@ -57,6 +61,7 @@ impl Default for TrackConfig {
             confirm_span_s: 1.0,
             gnss_correlation_s: 300.0,
             heading_correlation_s: 600.0,
+            mount_correlation_s: 1800.0,
             forget_suspected_s: 20.0,
         }
     }
@@ -132,6 +137,8 @@ pub struct Tracker {
     config: TrackConfig,
     fires: Vec<Fire>,
     next: FireId,
+    shared: SharedEstimate,
+    last_step: Option<ServiceTime>,
 }
 
 /// Chi-square 99.9 % for three degrees of freedom: bearing and disparity. A fire is sighted
@@ -150,13 +157,25 @@ impl Tracker {
     /// No fires yet; the first one gets number `first`.
     #[must_use]
     pub fn new(config: TrackConfig, first: FireId) -> Self {
-        Self { config, fires: Vec::new(), next: first }
+        Self {
+            config,
+            fires: Vec::new(),
+            next: first,
+            shared: SharedEstimate::default(),
+            last_step: None,
+        }
     }
 
     /// All fires, in order of their numbers.
     #[must_use]
     pub fn fires(&self) -> &[Fire] {
         &self.fires
+    }
+
+    /// What is known of the errors that all fires share.
+    #[must_use]
+    pub fn shared(&self) -> &SharedEstimate {
+        &self.shared
     }
 
     /// Takes one frame in. Sightings come back with the fire that they were given to.
@@ -166,9 +185,7 @@ impl Tracker {
         sightings: &[Classified],
         terrain: Option<&dyn Terrain>,
     ) -> Vec<Outcome> {
-        for fire in &mut self.fires {
-            fire.estimate.age(view.pose.at, &self.config);
-        }
+        self.age(view.pose.at);
         let assigned = self.associate(view, sightings);
         let mut outcomes = Vec::with_capacity(sightings.len());
         for (index, classified) in sightings.iter().enumerate() {
@@ -180,11 +197,28 @@ impl Tracker {
             };
             outcomes.push(Outcome { index, fire, fix: own });
         }
+        self.read_off();
         self.note_side_by_side(&outcomes);
         self.note_misses(view, &outcomes);
         self.merge();
         self.forget(view.pose.at);
         outcomes
+    }
+
+    /// Lets time pass since the last frame.
+    fn age(&mut self, now: ServiceTime) {
+        let dt_s = self.last_step.map_or(0.0, |last| (now - last).as_secs_f64());
+        self.last_step = Some(now);
+        if let Some(passage) = self.shared.age(dt_s, &self.config) {
+            self.fires.iter_mut().for_each(|fire| fire.estimate.pass(&passage));
+            self.read_off();
+        }
+    }
+
+    /// Every fire follows what was learned of the shared errors.
+    fn read_off(&mut self) {
+        let shared = &self.shared;
+        self.fires.iter_mut().for_each(|fire| fire.estimate.read_off(shared));
     }
 
     /// Nearest fire in the Mahalanobis sense for each sighting, each fire at most once.
@@ -195,7 +229,7 @@ impl Tracker {
                 if fire.class != classified.class || fire.merged_into.is_some() {
                     continue;
                 }
-                if let Some(distance) = fire.estimate.distance(&classified.sighting, view)
+                if let Some(distance) = fire.estimate.distance(&classified.sighting, view, &self.shared)
                     && distance < GATE
                 {
                     pairs.push((distance, index, slot));
@@ -259,7 +293,8 @@ impl Tracker {
         terrain: Option<&dyn Terrain>,
     ) -> FireId {
         let fire = &mut self.fires[slot];
-        fire.estimate.update(&classified.sighting, view, terrain);
+        fire.estimate.read_off(&self.shared);
+        fire.estimate.update(&classified.sighting, view, terrain, &mut self.shared);
         fire.evidence.hit(classified.score);
         fire.last_seen = classified.sighting.at;
         note_extent(fire, &classified.sighting, view);
@@ -283,8 +318,9 @@ impl Tracker {
         view: &View<'_>,
         terrain: Option<&dyn Terrain>,
     ) -> Option<FireId> {
-        let mut estimate = Estimate::start(&classified.sighting, own, view, terrain)?;
-        estimate.refine(&classified.sighting, view, terrain);
+        let mut estimate =
+            Estimate::start(&classified.sighting, own, view, terrain, &self.shared)?;
+        estimate.refine(&classified.sighting, view, terrain, &mut self.shared);
         let id = self.next;
         self.next = FireId(id.0.saturating_add(1));
         let mut fire = Fire {
@@ -349,7 +385,11 @@ impl Tracker {
             && open(a)
             && open(b)
             && apart < SIDE_BY_SIDE
-            && a.estimate.distance_between(&b.estimate, extent_m(a).max(extent_m(b))) < MERGE_GATE
+            && a.estimate.distance_between(
+                &b.estimate,
+                extent_m(a).max(extent_m(b)),
+                &self.shared,
+            ) < MERGE_GATE
     }
 
     fn forget(&mut self, now: ServiceTime) {
