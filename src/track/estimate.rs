@@ -1,19 +1,6 @@
-//! Position of one fire, given the shared errors.
-//!
-//! State `f`: east, north, up of the fire's base in the mission plane, and by how much the ground
-//! there is above the terrain model; metres. With the shared errors `n` (unit covariance a priori),
-//! a fire is kept as `f = m + G n + e`, `e ~ N(0, Q)`: given `n`, fires are independent of each
-//! other, so a sighting of one changes `n` and that one only, and all others follow through their
-//! `G`. This is the arrow-shaped joint estimate of all fires and shared errors, at a cost linear in
-//! fires.
-//!
-//! Source: the extended Kalman filter on the joint state (n, f), as in Bar-Shalom, Li, Kirubarajan,
-//! "Estimation with Applications to Tracking and Navigation" (2001), 10.3, iterated as in 10.5.2;
-//! the factored form is that of Montemerlo et al., "FastSLAM" (2002), with a Gaussian instead of
-//! particles for the shared part. Errors that wander correlate fires beyond `n`; that rest is
-//! neglected, which makes differences between fires look less sure than they are.
+//! Position of one fire: its sightings linearised, and taken into the [`Joint`] estimate.
 
-use super::shared::{Passage, SharedEstimate};
+use super::joint::{Joint, LOCAL, PER_FIRE};
 use crate::alarm::Method;
 use crate::locate::{Fix, SHARED, Shared, Sighting, Terrain, View};
 use emberfix_frames::{
@@ -22,30 +9,22 @@ use emberfix_frames::{
 use nalgebra::{SMatrix, SVector};
 use std::collections::BTreeSet;
 
-const STATES: usize = 4;
 const TERRAIN: usize = 3;
-const JOINT: usize = SHARED + STATES;
-type State = SVector<f64, STATES>;
-type StateCovariance = SMatrix<f64, STATES, STATES>;
-type ByShared = SMatrix<f64, STATES, SHARED>;
+type State = SVector<f64, PER_FIRE>;
 
-/// Where a fire is, how sure, and how its error hangs together with the shared errors.
+/// Where a fire is and how sure, read off the joint estimate, and what that rests on.
 #[derive(Debug, Clone)]
 pub struct Estimate {
-    given_zero: State,
-    by_shared: ByShared,
-    own: StateCovariance,
-    /// The marginal, kept beside for those who only read.
     state: State,
-    covariance: StateCovariance,
+    covariance: SMatrix<f64, PER_FIRE, PER_FIRE>,
     methods: BTreeSet<Method>,
     first_sight: Vector3<f64>,
 }
 
-/// A linearised measurement: residual to the prediction at `state` and zero shared errors.
+/// A linearised measurement: residual to the prediction at a state and zero shared errors.
 struct Measurement<const M: usize> {
     residual: SVector<f64, M>,
-    by_state: SMatrix<f64, M, STATES>,
+    by_state: SMatrix<f64, M, PER_FIRE>,
     by_shared: SMatrix<f64, M, SHARED>,
     noise: SMatrix<f64, M, M>,
 }
@@ -62,15 +41,16 @@ const PARALLAX_RAD: f64 = 0.05;
 const SLOPE_STEP_M: f64 = 5.0;
 
 impl Estimate {
-    /// Starts from a first fix: bearing known, range diffuse; [`Estimate::refine`] then takes in
-    /// what disparity and terrain say.
+    /// Starts from a first fix, as the last fire of the joint estimate: bearing known, range
+    /// diffuse; [`Estimate::refine`] then takes in what disparity and terrain say.
     #[must_use]
     pub fn start(
         sighting: &Sighting,
         fix: &Fix,
         view: &View<'_>,
         terrain: Option<&dyn Terrain>,
-        shared: &SharedEstimate,
+        joint: &mut Joint,
+        slot: usize,
     ) -> Option<Self> {
         let point = fix.enu.metres();
         let ray = (point - view.camera_enu).try_normalize(1e-6)?;
@@ -78,25 +58,21 @@ impl Estimate {
         let across = view.across_covariance(&ray, fix.range_m, sighting.base_sigma_px);
         let position: Matrix3<f64> = along * along.transpose() + across.m2();
         let terrain_sigma = terrain.map_or(0.0, |t| t.sigma_m(&fix.place));
-        let mut own = StateCovariance::zeros();
+        let mut own = SMatrix::<f64, PER_FIRE, PER_FIRE>::zeros();
         own.fixed_view_mut::<3, 3>(0, 0).copy_from(&position);
         own[(TERRAIN, TERRAIN)] = terrain_sigma * terrain_sigma;
         let mut placed_by_shared = scaled(view.position_by_shared(&point), view);
         placed_by_shared.set_column(Shared::Disparity as usize, &Vector3::zeros());
-        let mut by_shared = ByShared::zeros();
+        let mut by_shared = SMatrix::<f64, PER_FIRE, SHARED>::zeros();
         // The placed point is truth plus D n: the truth is the placed point minus D n.
         by_shared.fixed_view_mut::<3, SHARED>(0, 0).copy_from(&-placed_by_shared);
-        let mut started = Self {
-            given_zero: State::new(point.x, point.y, point.z, 0.0),
-            by_shared,
-            own,
-            state: State::zeros(),
-            covariance: StateCovariance::zeros(),
+        joint.add(&State::new(point.x, point.y, point.z, 0.0), &by_shared, &own);
+        Some(Self {
+            state: joint.fire(slot),
+            covariance: joint.between(slot, slot),
             methods: BTreeSet::new(),
             first_sight: ray,
-        };
-        started.read_off(shared);
-        Some(started)
+        })
     }
 
     /// Position in the mission plane, metres.
@@ -124,21 +100,10 @@ impl Estimate {
         self.methods.iter().copied().collect()
     }
 
-    /// Follows the shared errors over time.
-    pub fn pass(&mut self, passage: &Passage) {
-        let by_shared = self.by_shared * passage.old_by_new;
-        self.given_zero +=
-            self.by_shared * passage.mean_before - by_shared * passage.mean_after;
-        self.own += self.by_shared * passage.unsaid * self.by_shared.transpose();
-        self.by_shared = by_shared;
-    }
-
-    /// Computes position and covariance from what is known of the shared errors now.
-    pub fn read_off(&mut self, shared: &SharedEstimate) {
-        self.state = self.given_zero + self.by_shared * shared.mean;
-        let covariance =
-            self.own + self.by_shared * shared.covariance * self.by_shared.transpose();
-        self.covariance = (covariance + covariance.transpose()) * 0.5;
+    /// Reads position and covariance off the joint estimate.
+    pub fn read_off(&mut self, joint: &Joint, slot: usize) {
+        self.state = joint.fire(slot);
+        self.covariance = joint.between(slot, slot);
     }
 
     /// Squared Mahalanobis distance of a sighting, its disparity included when it has one; `None`
@@ -148,29 +113,14 @@ impl Estimate {
         &self,
         sighting: &Sighting,
         view: &View<'_>,
-        shared: &SharedEstimate,
+        joint: &Joint,
+        slot: usize,
     ) -> Option<f64> {
         let m = self.optical(sighting, view, &self.state)?;
-        let residual = m.residual - m.by_shared * shared.mean;
-        let by_joint = by_joint(&m);
-        let spread = by_joint * self.joint_covariance(shared) * by_joint.transpose() + m.noise;
+        let residual = m.residual - m.by_shared * joint.shared();
+        let by_local = by_local(&m);
+        let spread = by_local * joint.local(slot) * by_local.transpose() + m.noise;
         Some(residual.dot(&spread.cholesky()?.solve(&residual)))
-    }
-
-    /// Squared Mahalanobis distance, horizontal, between two fires, given that their shared errors
-    /// are the same ones; `extent_m` is how large the larger of them is.
-    #[must_use]
-    pub fn distance_between(&self, other: &Self, extent_m: f64, shared: &SharedEstimate) -> f64 {
-        let by_shared = self.by_shared - other.by_shared;
-        let spread =
-            self.own + other.own + by_shared * shared.covariance * by_shared.transpose();
-        let extent = nalgebra::Matrix2::identity() * (0.25 * extent_m * extent_m);
-        let spread = spread.fixed_view::<2, 2>(0, 0) + extent;
-        let difference = (self.state - other.state).fixed_rows::<2>(0).into_owned();
-        match spread.cholesky() {
-            Some(cholesky) => difference.dot(&cholesky.solve(&difference)),
-            None => f64::INFINITY,
-        }
     }
 
     /// Takes a sighting in: bearing, disparity, terrain. The shared errors learn from it.
@@ -179,15 +129,16 @@ impl Estimate {
         sighting: &Sighting,
         view: &View<'_>,
         terrain: Option<&dyn Terrain>,
-        shared: &mut SharedEstimate,
+        joint: &mut Joint,
+        slot: usize,
     ) {
         let sight = (self.position_m() - view.camera_enu).normalize();
         if sight.angle(&self.first_sight) > PARALLAX_RAD {
             self.methods.insert(Method::Parallax);
         }
-        self.take_optical(sighting, view, shared);
+        self.take_optical(sighting, view, joint, slot);
         self.note_stereo(sighting);
-        self.take_terrain(view, terrain, shared);
+        self.take_terrain(view, terrain, joint, slot);
     }
 
     /// Takes disparity and terrain of the first sighting in; its bearing is in the start already.
@@ -196,13 +147,14 @@ impl Estimate {
         sighting: &Sighting,
         view: &View<'_>,
         terrain: Option<&dyn Terrain>,
-        shared: &mut SharedEstimate,
+        joint: &mut Joint,
+        slot: usize,
     ) {
         if let Some(disparity) = self.disparity(sighting, view, &self.state) {
-            self.apply(&disparity, shared);
+            self.apply(&disparity, joint, slot);
         }
         self.note_stereo(sighting);
-        self.take_terrain(view, terrain, shared);
+        self.take_terrain(view, terrain, joint, slot);
     }
 
     fn note_stereo(&mut self, sighting: &Sighting) {
@@ -216,10 +168,11 @@ impl Estimate {
         &mut self,
         sighting: &Sighting,
         view: &View<'_>,
-        shared: &mut SharedEstimate,
+        joint: &mut Joint,
+        slot: usize,
     ) {
         let prior = self.state;
-        let covariance = self.joint_covariance(shared);
+        let covariance = joint.local(slot);
         let mut at = prior;
         for pass in 0..=PASSES {
             let Some(mut m) = self.optical(sighting, view, &at) else {
@@ -227,14 +180,14 @@ impl Estimate {
             };
             m.residual -= m.by_state * (prior - at);
             if pass == PASSES {
-                self.apply(&m, shared);
+                self.apply(&m, joint, slot);
                 return;
             }
             let Some(gain) = gain(&m, &covariance) else {
                 return;
             };
-            let step = gain * (m.residual - m.by_shared * shared.mean);
-            at = prior + step.fixed_rows::<STATES>(SHARED);
+            let step = gain * (m.residual - m.by_shared * joint.shared());
+            at = prior + step.fixed_rows::<PER_FIRE>(SHARED);
         }
     }
 
@@ -277,7 +230,7 @@ impl Estimate {
         let above = view.camera_enu + ray * view.range_beneath(&base, &ray)?;
         let height = (above - base).dot(view.up());
         let predicted = view.predict(&(base + view.up() * height))?;
-        let mut by_state = SMatrix::<f64, 1, STATES>::zeros();
+        let mut by_state = SMatrix::<f64, 1, PER_FIRE>::zeros();
         by_state.fixed_view_mut::<1, 3>(0, 0).copy_from(&predicted.disparity_by_position);
         Some(Measurement {
             residual: SVector::<f64, 1>::new(measured.px - predicted.disparity_px),
@@ -292,7 +245,8 @@ impl Estimate {
         &mut self,
         view: &View<'_>,
         terrain: Option<&dyn Terrain>,
-        shared: &mut SharedEstimate,
+        joint: &mut Joint,
+        slot: usize,
     ) {
         let Some(terrain) = terrain else {
             return;
@@ -306,69 +260,38 @@ impl Estimate {
             there[axis] += SLOPE_STEP_M;
             ground_up(&there, view, terrain).map_or(0.0, |up| (up - ground) / SLOPE_STEP_M)
         };
-        let by_state = SMatrix::<f64, 1, STATES>::new(-slope(0), -slope(1), 1.0, -1.0);
+        let by_state = SMatrix::<f64, 1, PER_FIRE>::new(-slope(0), -slope(1), 1.0, -1.0);
         let m = Measurement {
             residual: SVector::<f64, 1>::new(ground + self.state[TERRAIN] - here.z),
             by_state,
             by_shared: SMatrix::zeros(),
             noise: SMatrix::<f64, 1, 1>::new(TERRAIN_NOISE_M * TERRAIN_NOISE_M),
         };
-        self.apply(&m, shared);
+        self.apply(&m, joint, slot);
         self.methods.insert(Method::Terrain);
     }
 
-    /// Covariance of (shared errors, this fire).
-    fn joint_covariance(&self, shared: &SharedEstimate) -> SMatrix<f64, JOINT, JOINT> {
-        let with_shared = self.by_shared * shared.covariance;
-        let mut joint = SMatrix::<f64, JOINT, JOINT>::zeros();
-        joint.fixed_view_mut::<SHARED, SHARED>(0, 0).copy_from(&shared.covariance);
-        joint.fixed_view_mut::<STATES, SHARED>(SHARED, 0).copy_from(&with_shared);
-        joint.fixed_view_mut::<SHARED, STATES>(0, SHARED).copy_from(&with_shared.transpose());
-        joint.fixed_view_mut::<STATES, STATES>(SHARED, SHARED).copy_from(&self.covariance);
-        joint
-    }
-
-    /// One update of (shared errors, this fire); then the fire is conditioned on the shared errors
-    /// anew. A measurement that numbers can't take in is left out.
-    fn apply<const M: usize>(&mut self, m: &Measurement<M>, shared: &mut SharedEstimate) {
-        let prior = self.joint_covariance(shared);
-        let Some(gain) = gain(m, &prior) else {
-            return;
-        };
-        let step = gain * (m.residual - m.by_shared * shared.mean);
-        let posterior = prior - gain * by_joint(m) * prior;
-        let posterior = (posterior + posterior.transpose()) * 0.5;
-        let of_shared = posterior.fixed_view::<SHARED, SHARED>(0, 0).into_owned();
-        let Some(inverse) = of_shared.try_inverse() else {
-            return;
-        };
-        shared.mean += step.fixed_rows::<SHARED>(0);
-        shared.covariance = of_shared;
-        let state = self.state + step.fixed_rows::<STATES>(SHARED);
-        let with_shared = posterior.fixed_view::<STATES, SHARED>(SHARED, 0).into_owned();
-        let covariance = posterior.fixed_view::<STATES, STATES>(SHARED, SHARED).into_owned();
-        self.by_shared = with_shared * inverse;
-        self.given_zero = state - self.by_shared * shared.mean;
-        let own = covariance - self.by_shared * with_shared.transpose();
-        self.own = (own + own.transpose()) * 0.5;
-        self.read_off(shared);
+    fn apply<const M: usize>(&mut self, m: &Measurement<M>, joint: &mut Joint, slot: usize) {
+        let residual = m.residual - m.by_shared * joint.shared();
+        joint.update(slot, &residual, &by_local(m), &m.noise);
+        self.read_off(joint, slot);
     }
 }
 
-fn by_joint<const M: usize>(m: &Measurement<M>) -> SMatrix<f64, M, JOINT> {
-    let mut by_joint = SMatrix::<f64, M, JOINT>::zeros();
-    by_joint.fixed_view_mut::<M, SHARED>(0, 0).copy_from(&m.by_shared);
-    by_joint.fixed_view_mut::<M, STATES>(0, SHARED).copy_from(&m.by_state);
-    by_joint
+fn by_local<const M: usize>(m: &Measurement<M>) -> SMatrix<f64, M, LOCAL> {
+    let mut by_local = SMatrix::<f64, M, LOCAL>::zeros();
+    by_local.fixed_view_mut::<M, SHARED>(0, 0).copy_from(&m.by_shared);
+    by_local.fixed_view_mut::<M, PER_FIRE>(0, SHARED).copy_from(&m.by_state);
+    by_local
 }
 
 fn gain<const M: usize>(
     m: &Measurement<M>,
-    joint: &SMatrix<f64, JOINT, JOINT>,
-) -> Option<SMatrix<f64, JOINT, M>> {
-    let by_joint = by_joint(m);
-    let lever = joint * by_joint.transpose();
-    let inverse = (by_joint * lever + m.noise).try_inverse()?;
+    local: &SMatrix<f64, LOCAL, LOCAL>,
+) -> Option<SMatrix<f64, LOCAL, M>> {
+    let by_local = by_local(m);
+    let lever = local * by_local.transpose();
+    let inverse = (by_local * lever + m.noise).try_inverse()?;
     Some(lever * inverse)
 }
 
