@@ -60,8 +60,8 @@ impl Default for TrackConfig {
         Self {
             confirm_sightings: 4,
             confirm_span_s: 1.0,
-            gnss_correlation_s: 300.0,
-            heading_correlation_s: 600.0,
+            gnss_correlation_s: 100.0,
+            heading_correlation_s: 300.0,
             mount_correlation_s: 1800.0,
             forget_suspected_s: 20.0,
         }

@@ -178,7 +178,7 @@ fn looking_longer_never_makes_a_constant_gnss_error_smaller() {
     let (tracker, _) = fly(Path::StraightIn, 1, 15);
     let fire = &tracker.fires()[0];
     let horizontal = fire.covariance().m2()[(0, 0)].sqrt();
-    // 1.5 m per axis is the floor; the wander of 5 s at 300 s correlation is worth a few percent.
+    // 1.5 m per axis is the floor; the wander of 5 s at 100 s correlation is worth a few percent.
     assert!(horizontal > 1.45, "{horizontal}");
     assert_eq!(fire.methods(), [Method::Stereo, Method::Parallax, Method::Terrain]);
     assert_eq!(fire.state, FireState::Confirmed);
