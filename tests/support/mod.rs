@@ -54,9 +54,6 @@ pub struct Scratch {
     folder: tempfile::TempDir,
 }
 
-/// Columns, rows of the plain rig.
-pub const PLAIN_SIZE_PX: (i32, i32) = (640, 360);
-
 impl Scratch {
     /// Holds `rig.toml` (no distortion, 30 degrees down, 300 mm) and `mission.toml`, which names a
     /// model that is not there: give `--boxes`, or name another.
