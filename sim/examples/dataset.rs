@@ -7,8 +7,10 @@ fn main() -> anyhow::Result<()> {
     let [dir, pictures, seed] = arguments.as_slice() else {
         anyhow::bail!("usage: dataset DIR PICTURES SEED");
     };
-    let rig = Rig::load(concat!(env!("CARGO_MANIFEST_DIR"), "/../calib/rigs/oakd-75mm.toml").as_ref())?;
-    let summary = emberfix_sim::dataset::write(dir.as_ref(), pictures.parse()?, seed.parse()?, &rig)?;
+    let rig =
+        Rig::load(concat!(env!("CARGO_MANIFEST_DIR"), "/../calib/rigs/oakd-75mm.toml").as_ref())?;
+    let summary =
+        emberfix_sim::dataset::write(dir.as_ref(), pictures.parse()?, seed.parse()?, &rig)?;
     println!("{summary:?}");
     Ok(())
 }

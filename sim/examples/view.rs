@@ -1,12 +1,12 @@
 //! Renders one stereo pair of a small world and says how long it took.
 //!
-//! `cargo run --release -p emberfix-sim --example view -- OUT_PREFIX RANGE_M UP_M BANK_DEG`
+//! `cargo run --release -p emberfix-sim --example view -- OUT_PREFIX RANGE_M UP_M BANK_DEG PAIRS`
 
 use emberfix_calib::{Eye, Rig};
 use emberfix_sim::render::{RenderConfig, Renderer, StereoCamera};
 use emberfix_sim::state::BodyState;
 use emberfix_sim::world::{World, WorldConfig};
-use nalgebra::{Rotation3, Matrix3, Vector3};
+use nalgebra::{Matrix3, Rotation3, Vector3};
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -57,11 +57,12 @@ size_m = 0.3
 
 fn main() -> anyhow::Result<()> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
-    let [prefix, range, up, bank] = arguments.as_slice() else {
-        anyhow::bail!("usage: view OUT_PREFIX RANGE_M UP_M BANK_DEG");
+    let [prefix, range, up, bank, pairs] = arguments.as_slice() else {
+        anyhow::bail!("usage: view OUT_PREFIX RANGE_M UP_M BANK_DEG PAIRS");
     };
     let (range_m, up_m, bank_deg): (f64, f64, f64) = (range.parse()?, up.parse()?, bank.parse()?);
-    let rig = Rig::load(concat!(env!("CARGO_MANIFEST_DIR"), "/../calib/rigs/oakd-75mm.toml").as_ref())?;
+    let rig =
+        Rig::load(concat!(env!("CARGO_MANIFEST_DIR"), "/../calib/rigs/oakd-75mm.toml").as_ref())?;
     let config: WorldConfig = toml::from_str(WORLD)?;
     let world = Arc::new(World::new(&config, 7)?);
     let renderer = Renderer::new(world, StereoCamera::new(&rig), RenderConfig::default());
@@ -90,11 +91,18 @@ fn main() -> anyhow::Result<()> {
     }
     println!("labels: {:.1} ms", started.elapsed().as_secs_f64() * 1e3);
     let started = Instant::now();
-    for k in 0..10 {
+    let pairs: u32 = pairs.parse()?;
+    for k in 0..pairs {
         let t_s = 3.0 + f64::from(k) / 10.0;
-        std::hint::black_box((renderer.render(Eye::Left, &body, t_s), renderer.render(Eye::Right, &body, t_s)));
+        std::hint::black_box((
+            renderer.render(Eye::Left, &body, t_s),
+            renderer.render(Eye::Right, &body, t_s),
+        ));
     }
-    println!("{:.1} ms a pair", started.elapsed().as_secs_f64() * 100.0);
+    println!(
+        "{:.1} ms a pair",
+        started.elapsed().as_secs_f64() * 1e3 / f64::from(pairs.max(1))
+    );
     Ok(())
 }
 

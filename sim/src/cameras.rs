@@ -5,24 +5,12 @@ use crate::flight::Flight;
 use crate::mission::{CameraConfig, Mission};
 use crate::noise::{normal, stream};
 use crate::render::{RenderConfig, Renderer, StereoCamera, encode_jpeg};
+use crate::score::{Class, Truth};
 use crate::stream::EncodedPair;
-use crate::world::World;
+use crate::world::{BurningClass, FireTruth, World};
 use emberfix_calib::Eye;
 use emberfix_frames::{ServiceTime, seconds};
 use std::sync::Arc;
-
-/// Why there is no picture.
-#[derive(Debug, thiserror::Error)]
-pub enum CameraError {
-    /// The image could not be compressed.
-    #[error("pair {index}: image could not be compressed: {reason}")]
-    Compress {
-        /// Number of the pair.
-        index: u32,
-        /// What the encoder said.
-        reason: String,
-    },
-}
 
 /// Takes the pictures of one flight.
 pub struct Cameras {
@@ -45,7 +33,14 @@ impl Cameras {
     ) -> Self {
         let camera = StereoCamera::new(&mission.rig);
         Self {
-            renderer: Renderer::new(world, camera, RenderConfig::default()),
+            renderer: Renderer::new(
+                world,
+                camera,
+                RenderConfig {
+                    seed: mission.sim.seed,
+                    ..RenderConfig::default()
+                },
+            ),
             flight,
             config: mission.sim.camera,
             errors: if errors.off {
@@ -77,31 +72,76 @@ impl Cameras {
     }
 
     /// Renders and compresses a pair.
-    ///
-    /// # Errors
-    /// [`CameraError`] when an image can't be compressed.
-    pub fn take(&self, index: u32) -> Result<TakenPair, CameraError> {
+    #[must_use]
+    pub fn take(&self, index: u32) -> TakenPair {
         let taken_s = self.taken_s(index);
         let state = self.flight.state(taken_s);
-        let image = |eye| {
+        let jpeg = |eye| {
             let frame = self.renderer.render(eye, &state, taken_s);
-            encode_jpeg(&frame, self.config.jpeg_quality).map_err(|error| CameraError::Compress {
-                index,
-                reason: error.to_string(),
-            })
+            encode_jpeg(&frame, self.config.jpeg_quality)
         };
-        Ok(TakenPair {
+        TakenPair {
             stamped_s: taken_s + self.stamp_error_s(index),
             arrives_s: self.arrives_s(index),
-            left: image(Eye::Left)?,
-            right: image(Eye::Right)?,
-        })
+            left: jpeg(Eye::Left),
+            right: jpeg(Eye::Right),
+        }
+    }
+
+    /// What burns in the world and was seen by the left eye in [`SEEN_PAIRS`] pairs at least.
+    #[must_use]
+    pub fn seen(&self) -> Vec<Truth> {
+        let fires = self.renderer.world().fires();
+        let mut pairs = vec![0_u32; fires.len()];
+        for index in 0..self.count() {
+            for fire in self.seen_in(index) {
+                pairs[fire] += 1;
+            }
+        }
+        let seen = fires
+            .iter()
+            .zip(pairs)
+            .filter(|(_, pairs)| *pairs >= SEEN_PAIRS);
+        seen.map(|(fire, _)| truth(fire)).collect()
+    }
+
+    /// Indices of the fires whose own class is seen in a pair: a flame's plume does not count.
+    fn seen_in(&self, index: u32) -> Vec<usize> {
+        let taken_s = self.taken_s(index);
+        let fires = self.renderer.world().fires();
+        let boxes = self
+            .renderer
+            .label_boxes(&self.flight.state(taken_s), taken_s);
+        let own = boxes
+            .iter()
+            .filter(|seen| fires[seen.fire].class == seen.class);
+        let large = own.filter(|seen| {
+            (seen.right_px - seen.left_px).max(seen.bottom_px - seen.top_px) >= SEEN_PX
+        });
+        large.map(|seen| seen.fire).collect()
     }
 
     /// The camera's stamp minus mid-exposure: the rig file's offset takes its own part away again.
     fn stamp_error_s(&self, index: u32) -> f64 {
         let jitter = normal(&mut stream(self.seed, &format!("camera stamp {index}")));
         self.errors.camera_offset_s - self.rig_offset_s + self.errors.camera_jitter_s * jitter
+    }
+}
+
+/// Pairs in which a fire must be seen before it must be found.
+pub const SEEN_PAIRS: u32 = 5;
+/// Longer side that counts as seen, pixels.
+pub const SEEN_PX: f64 = 8.0;
+
+fn truth(fire: &FireTruth) -> Truth {
+    let class = match fire.class {
+        BurningClass::Fire => Class::Fire,
+        BurningClass::Smoke => Class::Smoke,
+    };
+    Truth {
+        name: fire.name.clone(),
+        class,
+        base_m: fire.base_m,
     }
 }
 

@@ -9,11 +9,13 @@
 //! and letter-boxed. The same rig, count and seed give the same bytes.
 //! **Known limits.** One lens and one kind of flame: real pictures must be mixed in.
 
-use crate::render::{Frame, LabelBox, PixelFormat, RenderConfig, Renderer, StereoCamera, encode_jpeg};
+use crate::render::{
+    Frame, LabelBox, PixelFormat, RenderConfig, Renderer, StereoCamera, encode_jpeg,
+};
 use crate::state::BodyState;
 use crate::world::{
-    BurningClass, FireConfig, GroundCover, LightConfig, LookalikeConfig, LookalikeKind, SmokeConfig,
-    TerrainConfig, TreesConfig, WindConfig, World, WorldConfig, WorldError,
+    BurningClass, FireConfig, GroundCover, LightConfig, LookalikeConfig, LookalikeKind,
+    SmokeConfig, TerrainConfig, TreesConfig, WindConfig, World, WorldConfig, WorldError,
 };
 use emberfix_calib::{Eye, Rig};
 use image::{RgbImage, imageops};
@@ -103,7 +105,9 @@ pub fn write(
             write_world(dir, numbers, seed.wrapping_add((k as u64) << 20), &camera)
         })
         .collect();
-    Ok(summaries?.iter().fold(DatasetSummary::default(), DatasetSummary::plus))
+    Ok(summaries?
+        .iter()
+        .fold(DatasetSummary::default(), DatasetSummary::plus))
 }
 
 impl DatasetSummary {
@@ -118,7 +122,10 @@ impl DatasetSummary {
     }
 
     fn count(&mut self, labels: &[YoloBox]) {
-        let fires = labels.iter().filter(|label| label.class == BurningClass::Fire).count();
+        let fires = labels
+            .iter()
+            .filter(|label| label.class == BurningClass::Fire)
+            .count();
         self.pictures += 1;
         self.with_fire += usize::from(fires > 0);
         self.empty += usize::from(labels.is_empty());
@@ -136,7 +143,11 @@ fn write_world(
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let config = random_world(&mut rng);
     let world = Arc::new(World::new(&config, seed)?);
-    let renderer = Renderer::new(world, camera.clone(), random_exposure(&mut rng, &config.light));
+    let renderer = Renderer::new(
+        world,
+        camera.clone(),
+        random_exposure(&mut rng, &config.light),
+    );
     let mut summary = DatasetSummary::default();
     for number in numbers {
         let t_s = rng.random_range(0.0..600.0);
@@ -153,8 +164,14 @@ fn write_world(
 fn save(dir: &Path, number: usize, picture: &Picture, quality: u8) -> Result<(), DatasetError> {
     let text: String = picture.labels.iter().map(YoloBox::line).collect();
     let files = [
-        (dir.join(format!("images/{number:06}.jpg")), encode_jpeg(&picture.frame, quality)),
-        (dir.join(format!("labels/{number:06}.txt")), text.into_bytes()),
+        (
+            dir.join(format!("images/{number:06}.jpg")),
+            encode_jpeg(&picture.frame, quality),
+        ),
+        (
+            dir.join(format!("labels/{number:06}.txt")),
+            text.into_bytes(),
+        ),
     ];
     for (path, bytes) in files {
         std::fs::write(&path, bytes).map_err(|source| DatasetError::Write { path, source })?;
@@ -183,7 +200,10 @@ impl YoloBox {
             BurningClass::Fire => 0,
             BurningClass::Smoke => 1,
         };
-        let (cx, cy) = (0.5 * (self.left + self.right), 0.5 * (self.top + self.bottom));
+        let (cx, cy) = (
+            0.5 * (self.left + self.right),
+            0.5 * (self.top + self.bottom),
+        );
         let (width, height) = (self.right - self.left, self.bottom - self.top);
         format!("{class} {cx:.6} {cy:.6} {width:.6} {height:.6}\n")
     }
@@ -203,10 +223,17 @@ impl Window {
         // Half a pixel: label edges count from the first pixel's centre, shares from its edge.
         let across = |px: f64| (px + 0.5) * self.scale + self.shift.0;
         let down = |px: f64| (px + 0.5) * self.scale + self.shift.1;
-        let whole = (label.right_px - label.left_px) * (label.bottom_px - label.top_px) * self.scale.powi(2);
-        let (left, right) = (across(label.left_px).max(0.0), across(label.right_px).min(side));
-        let (top, bottom) =
-            (down(label.top_px).max(self.rows.0), down(label.bottom_px).min(self.rows.1));
+        let whole = (label.right_px - label.left_px)
+            * (label.bottom_px - label.top_px)
+            * self.scale.powi(2);
+        let (left, right) = (
+            across(label.left_px).max(0.0),
+            across(label.right_px).min(side),
+        );
+        let (top, bottom) = (
+            down(label.top_px).max(self.rows.0),
+            down(label.bottom_px).min(self.rows.1),
+        );
         let seen = (right - left).max(0.0) * (bottom - top).max(0.0);
         let big = right - left >= LEAST_PX && bottom - top >= LEAST_PX;
         (big && seen >= LEAST_SHARE * whole).then(|| YoloBox {
@@ -220,9 +247,15 @@ impl Window {
 }
 
 fn cut(rng: &mut ChaCha8Rng, frame: &Frame, boxes: &[LabelBox]) -> Picture {
-    let (frame, window) =
-        if rng.random_bool(0.15) { letter_boxed(frame) } else { cropped(rng, frame, boxes) };
-    let labels = boxes.iter().filter_map(|label| window.label(label)).collect();
+    let (frame, window) = if rng.random_bool(0.15) {
+        letter_boxed(frame)
+    } else {
+        cropped(rng, frame, boxes)
+    };
+    let labels = boxes
+        .iter()
+        .filter_map(|label| window.label(label))
+        .collect();
     Picture { frame, labels }
 }
 
@@ -237,23 +270,47 @@ fn letter_boxed(frame: &Frame) -> (Frame, Window) {
         imageops::replace(&mut canvas, &small, i64::from(x), i64::from(y));
     }
     let (x, y) = (f64::from(x), f64::from(y));
-    (from_rgb(canvas), Window { scale, shift: (x, y), rows: (y, y + f64::from(height)) })
+    (
+        from_rgb(canvas),
+        Window {
+            scale,
+            shift: (x, y),
+            rows: (y, y + f64::from(height)),
+        },
+    )
 }
 
 fn from_rgb(picture: RgbImage) -> Frame {
     let (width, height) = picture.dimensions();
     let bytes = picture.pixels().flat_map(|p| [p[2], p[1], p[0]]).collect();
-    Frame { width, height, format: PixelFormat::Bgr8, bytes }
+    Frame {
+        width,
+        height,
+        format: PixelFormat::Bgr8,
+        bytes,
+    }
 }
 
 /// Around a flame where there is one, so that few pictures are of nothing.
 fn cropped(rng: &mut ChaCha8Rng, frame: &Frame, boxes: &[LabelBox]) -> (Frame, Window) {
-    let flames: Vec<&LabelBox> =
-        boxes.iter().filter(|label| label.class == BurningClass::Fire).collect();
-    let pick = if flames.is_empty() { boxes.choose(rng) } else { flames.choose(rng).copied() };
-    let middle = pick.map_or((0.5 * f64::from(frame.width), 0.5 * f64::from(frame.height)), |label| {
-        (0.5 * (label.left_px + label.right_px), 0.5 * (label.top_px + label.bottom_px))
-    });
+    let flames: Vec<&LabelBox> = boxes
+        .iter()
+        .filter(|label| label.class == BurningClass::Fire)
+        .collect();
+    let pick = if flames.is_empty() {
+        boxes.choose(rng)
+    } else {
+        flames.choose(rng).copied()
+    };
+    let middle = pick.map_or(
+        (0.5 * f64::from(frame.width), 0.5 * f64::from(frame.height)),
+        |label| {
+            (
+                0.5 * (label.left_px + label.right_px),
+                0.5 * (label.top_px + label.bottom_px),
+            )
+        },
+    );
     let mut start = |middle: f64, most: u32| {
         let wanted = middle - f64::from(SIDE) * rng.random_range(0.1..0.9);
         wanted.clamp(0.0, f64::from(most - SIDE)).round() as u32
@@ -264,16 +321,32 @@ fn cropped(rng: &mut ChaCha8Rng, frame: &Frame, boxes: &[LabelBox]) -> (Frame, W
         &frame.bytes[first..first + 3 * SIDE as usize]
     };
     let bytes = (0..SIDE).flat_map(line).copied().collect();
-    let crop = Frame { width: SIDE, height: SIDE, format: PixelFormat::Bgr8, bytes };
+    let crop = Frame {
+        width: SIDE,
+        height: SIDE,
+        format: PixelFormat::Bgr8,
+        bytes,
+    };
     let shift = (-f64::from(x), -f64::from(y));
-    (crop, Window { scale: 1.0, shift, rows: (0.0, f64::from(SIDE)) })
+    (
+        crop,
+        Window {
+            scale: 1.0,
+            shift,
+            rows: (0.0, f64::from(SIDE)),
+        },
+    )
 }
 
 /// Half side of the square in which things stand, metres.
 const FIELD_M: f64 = 45.0;
 
 fn random_world(rng: &mut ChaCha8Rng) -> WorldConfig {
-    let fires = if rng.random_bool(0.72) { rng.random_range(1..=5) } else { 0 };
+    let fires = if rng.random_bool(0.72) {
+        rng.random_range(1..=5)
+    } else {
+        0
+    };
     let smokes = u32::from(rng.random_bool(0.3));
     let lookalikes = rng.random_range(0..=6);
     WorldConfig {
@@ -304,7 +377,11 @@ fn random_terrain(rng: &mut ChaCha8Rng) -> TerrainConfig {
     }
     let amplitude_m = rng.random_range(0.5..8.0);
     let wavelength_m = amplitude_m * rng.random_range(16.0..50.0);
-    TerrainConfig::Hills { amplitude_m, wavelength_m, seed: rng.random() }
+    TerrainConfig::Hills {
+        amplitude_m,
+        wavelength_m,
+        seed: rng.random(),
+    }
 }
 
 fn random_ground(rng: &mut ChaCha8Rng) -> Vec<GroundCover> {
@@ -324,13 +401,21 @@ fn random_ground(rng: &mut ChaCha8Rng) -> Vec<GroundCover> {
 
 fn random_light(rng: &mut ChaCha8Rng) -> LightConfig {
     // A third of the days is overcast; some evenings are nearly dark.
-    let sun = if rng.random_bool(0.33) { 0.0 } else { rng.random_range(0.3..1.1) };
+    let sun = if rng.random_bool(0.33) {
+        0.0
+    } else {
+        rng.random_range(0.3..1.1)
+    };
     let dusk = rng.random_bool(0.15);
     LightConfig {
         sun_azimuth_deg: rng.random_range(0.0..360.0),
         sun_elevation_deg: rng.random_range(12.0..75.0),
         sun: if dusk { 0.0 } else { sun },
-        ambience: if dusk { rng.random_range(0.05..0.3) } else { rng.random_range(0.6..1.4) },
+        ambience: if dusk {
+            rng.random_range(0.05..0.3)
+        } else {
+            rng.random_range(0.6..1.4)
+        },
         visibility_m: log_uniform(rng, 400.0, 20_000.0),
     }
 }
@@ -388,11 +473,19 @@ fn random_lookalike(rng: &mut ChaCha8Rng) -> LookalikeConfig {
         LookalikeKind::Lantern => rng.random_range(0.1..0.5),
     };
     let place = random_place(rng);
-    LookalikeConfig { kind, east_m: place.x, north_m: place.y, size_m }
+    LookalikeConfig {
+        kind,
+        east_m: place.x,
+        north_m: place.y,
+        size_m,
+    }
 }
 
 fn random_place(rng: &mut ChaCha8Rng) -> Vector2<f64> {
-    Vector2::new(rng.random_range(-FIELD_M..FIELD_M), rng.random_range(-FIELD_M..FIELD_M))
+    Vector2::new(
+        rng.random_range(-FIELD_M..FIELD_M),
+        rng.random_range(-FIELD_M..FIELD_M),
+    )
 }
 
 fn log_uniform(rng: &mut ChaCha8Rng, low: f64, high: f64) -> f64 {
@@ -409,7 +502,10 @@ fn random_pose(
     let place = random_target(rng, config);
     let target = Vector3::new(place.x, place.y, world.ground_up_m(place.x, place.y));
     let range_m = log_uniform(rng, 10.0, 100.0);
-    let height_m = rng.random_range(8.0..80.0_f64).min(0.95 * range_m).max(0.25 * range_m);
+    let height_m = rng
+        .random_range(8.0..80.0_f64)
+        .min(0.95 * range_m)
+        .max(0.25 * range_m);
     let (sin, cos) = rng.random_range(0.0..TAU).sin_cos();
     let out_m = (range_m * range_m - height_m * height_m).max(0.0).sqrt();
     let mut eye = target + Vector3::new(out_m * cos, out_m * sin, height_m);
@@ -425,13 +521,28 @@ fn random_pose(
 }
 
 fn random_target(rng: &mut ChaCha8Rng, config: &WorldConfig) -> Vector2<f64> {
-    let fires = config.fires.iter().map(|f| Vector2::new(f.east_m, f.north_m));
-    let smokes = config.smokes.iter().map(|s| Vector2::new(s.east_m, s.north_m));
+    let fires = config
+        .fires
+        .iter()
+        .map(|f| Vector2::new(f.east_m, f.north_m));
+    let smokes = config
+        .smokes
+        .iter()
+        .map(|s| Vector2::new(s.east_m, s.north_m));
     let burning: Vec<_> = fires.chain(smokes).collect();
-    let others: Vec<_> =
-        config.lookalikes.iter().map(|l| Vector2::new(l.east_m, l.north_m)).collect();
-    let pool = if burning.is_empty() || rng.random_bool(0.1) { &others } else { &burning };
-    pool.choose(rng).copied().unwrap_or_else(|| random_place(rng))
+    let others: Vec<_> = config
+        .lookalikes
+        .iter()
+        .map(|l| Vector2::new(l.east_m, l.north_m))
+        .collect();
+    let pool = if burning.is_empty() || rng.random_bool(0.1) {
+        &others
+    } else {
+        &burning
+    };
+    pool.choose(rng)
+        .copied()
+        .unwrap_or_else(|| random_place(rng))
 }
 
 /// Camera axes (right, down, boresight as columns) for a look along `way`.
@@ -463,7 +574,10 @@ mod tests {
         assert_eq!(summary, write(two.path(), 5, 3, &rig()).unwrap());
         assert_eq!(summary.pictures, 5);
         for number in 0..5 {
-            for name in [format!("images/{number:06}.jpg"), format!("labels/{number:06}.txt")] {
+            for name in [
+                format!("images/{number:06}.jpg"),
+                format!("labels/{number:06}.txt"),
+            ] {
                 let read = |dir: &Path| std::fs::read(dir.join(&name)).unwrap();
                 assert_eq!(read(one.path()), read(two.path()), "{name}");
             }
@@ -472,7 +586,11 @@ mod tests {
 
     #[test]
     fn a_label_follows_its_window_and_is_dropped_when_little_of_it_is_left() {
-        let window = Window { scale: 1.0, shift: (-100.0, -50.0), rows: (0.0, 416.0) };
+        let window = Window {
+            scale: 1.0,
+            shift: (-100.0, -50.0),
+            rows: (0.0, 416.0),
+        };
         let label = |left_px: f64| LabelBox {
             class: BurningClass::Fire,
             fire: 0,
@@ -484,7 +602,10 @@ mod tests {
         let inside = window.label(&label(199.5)).unwrap();
         assert!((inside.left * 416.0 - 100.0).abs() < 1e-9);
         assert!((inside.bottom * 416.0 - 100.0).abs() < 1e-9);
-        assert!(window.label(&label(65.0)).is_none(), "a fifth of it is left");
+        assert!(
+            window.label(&label(65.0)).is_none(),
+            "a fifth of it is left"
+        );
         assert!(window.label(&label(80.0)).is_some(), "half of it is left");
     }
 }

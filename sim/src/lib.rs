@@ -7,6 +7,7 @@
 pub mod autopilot;
 pub mod cameras;
 pub mod dataset;
+pub mod demo;
 pub mod earth;
 pub mod flight;
 pub mod live;

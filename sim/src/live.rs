@@ -1,7 +1,7 @@
 //! A flight in real time: MAVLink over UDP, stereo pairs over a socket.
 //!
-//! **In:** a [`Mission`] and the service's URLs. **Out:** what was sent and heard. Flight time zero is
-//! [`LEAD_IN_S`] after the start; until then only the autopilot talks.
+//! **In:** a [`Mission`] and the service's URLs. **Out:** what was sent and heard. The flight begins
+//! [`LEAD_IN_S`] after the service has opened its camera socket; until then only the autopilot talks.
 //!
 //! **Queues.** The renderer works ahead of time by at most [`RENDER_AHEAD`] pairs, then waits. A pair
 //! that is not ready [`LATE_LIMIT_S`] after its time, or that nobody listens to, is dropped and
@@ -53,6 +53,14 @@ pub enum LiveError {
         url: String,
         /// What would have been accepted.
         forms: &'static str,
+    },
+    /// Nobody took the camera's connection.
+    #[error("{url}: nobody took the camera's connection within {waited_s} s; is the service up?")]
+    Nobody {
+        /// Which URL.
+        url: String,
+        /// How long was waited, seconds.
+        waited_s: u64,
     },
     /// The port could not be opened.
     #[error("{url}: {source}")]
@@ -155,6 +163,8 @@ pub struct LiveFlight<'a> {
     pub errors: &'a ErrorsConfig,
     /// Where the service is.
     pub edges: Edges,
+    /// How long the service may take to open its camera socket.
+    pub service_limit: Duration,
 }
 
 impl LiveFlight<'_> {
@@ -165,6 +175,7 @@ impl LiveFlight<'_> {
     pub fn fly(&self, control: &Control) -> Result<Flown, LiveError> {
         let port = MavlinkPort::open(&self.edges.mavlink)?;
         let mut doorway = CameraDoorway::open(&self.edges.camera)?;
+        let socket = self.await_service(&mut doorway, control)?;
         let clock = FlightClock::starting_in(LEAD_IN_S);
         let cameras = Cameras::new(
             self.mission,
@@ -185,12 +196,35 @@ impl LiveFlight<'_> {
                 }
             });
             scope.spawn(|| render_ahead(&cameras, &clock, control, sender));
-            self.show(&mut doorway, &clock, control, &receiver, &mut flown);
+            self.show(socket, &mut doorway, &clock, control, &receiver, &mut flown);
             drop(receiver);
             pictures_over.store(true, Ordering::Relaxed);
         });
         flown.heard = heard.into_inner().unwrap_or_default();
         Ok(flown)
+    }
+
+    /// The service's camera socket; `None` when the flight was stopped before it opened.
+    fn await_service(
+        &self,
+        doorway: &mut CameraDoorway,
+        control: &Control,
+    ) -> Result<Option<Box<dyn Write>>, LiveError> {
+        let since = Instant::now();
+        while !control.is_stopped() && since.elapsed() < self.service_limit {
+            if let Some(socket) = doorway.connect() {
+                return Ok(Some(socket));
+            }
+            std::thread::sleep(RETRY);
+        }
+        if control.is_stopped() {
+            return Ok(None);
+        }
+        let waited_s = self.service_limit.as_secs();
+        Err(LiveError::Nobody {
+            url: self.edges.camera.clone(),
+            waited_s,
+        })
     }
 
     /// The autopilot's loop.
@@ -229,13 +263,14 @@ impl LiveFlight<'_> {
     /// The camera's loop: every pair at its time.
     fn show(
         &self,
+        socket: Option<Box<dyn Write>>,
         doorway: &mut CameraDoorway,
         clock: &FlightClock,
         control: &Control,
         pairs: &Receiver<Rendered>,
         flown: &mut Flown,
     ) {
-        let mut listener: Option<Listener> = None;
+        let mut listener = socket.and_then(|socket| Listener::greet(socket, self, clock));
         while !control.is_stopped() {
             if listener.is_none() {
                 listener = doorway
@@ -297,13 +332,7 @@ fn render_ahead(
         let rendered = if late {
             Rendered::Late
         } else {
-            match cameras.take(index) {
-                Ok(pair) => Rendered::Pair(pair),
-                Err(error) => {
-                    tracing::error!(%error, "the camera stops");
-                    return;
-                }
-            }
+            Rendered::Pair(cameras.take(index))
         };
         if pairs.send(rendered).is_err() {
             return;

@@ -4,7 +4,7 @@
 //! if the service had asked ten times a second, so that a replay can keep time.
 
 use crate::autopilot::{Autopilot, AutopilotSetup, ErrorsConfig, Outgoing};
-use crate::cameras::{CameraError, Cameras, TakenPair};
+use crate::cameras::{Cameras, TakenPair};
 use crate::flight::Flight;
 use crate::mission::Mission;
 use crate::noise::stream;
@@ -17,17 +17,6 @@ use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 use std::io::{Seek, Write};
 use std::sync::Arc;
-
-/// Why a flight could not be recorded.
-#[derive(Debug, thiserror::Error)]
-pub enum RecordError {
-    /// The recording could not be written.
-    #[error(transparent)]
-    Stream(#[from] StreamError),
-    /// A picture could not be taken.
-    #[error(transparent)]
-    Camera(#[from] CameraError),
-}
 
 /// What was recorded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
@@ -51,7 +40,7 @@ const BATCH: u32 = 8;
 /// Flies `mission` offline into `destination`; `on_pair` hears how many pairs are done.
 ///
 /// # Errors
-/// [`RecordError`] when a picture can't be taken or the destination refuses bytes.
+/// [`StreamError`] when the destination refuses bytes.
 pub fn record<W: Write + Seek>(
     mission: &Mission,
     world: &Arc<World>,
@@ -59,15 +48,12 @@ pub fn record<W: Write + Seek>(
     errors: &ErrorsConfig,
     destination: W,
     mut on_pair: impl FnMut(u32),
-) -> Result<Recorded, RecordError> {
+) -> Result<Recorded, StreamError> {
     let cameras = Cameras::new(mission, Arc::clone(world), Arc::clone(flight), errors);
     let mut tape = Tape::new(mission, flight, errors, destination)?;
     for first in (0..cameras.count()).step_by(BATCH as usize) {
         let batch = first..(first + BATCH).min(cameras.count());
-        let pairs: Vec<_> = batch
-            .into_par_iter()
-            .map(|index| cameras.take(index))
-            .collect::<Result<_, _>>()?;
+        let pairs: Vec<_> = batch.into_par_iter().map(|index| cameras.take(index)).collect();
         for pair in pairs {
             tape.add_pair(mission, pair)?;
             on_pair(tape.recorded.pairs);
@@ -155,7 +141,7 @@ impl<W: Write + Seek> Tape<W> {
         Ok(())
     }
 
-    fn finish(mut self, end_s: f64) -> Result<Recorded, RecordError> {
+    fn finish(mut self, end_s: f64) -> Result<Recorded, StreamError> {
         self.advance(end_s)?;
         self.writer.finish()?;
         Ok(self.recorded)

@@ -36,7 +36,7 @@ mod url;
 pub use blocks::RECORD_LIMIT_BYTES;
 pub use camera::CaptureClock;
 pub use decode::{DecodeError, EyeHealth, EyeWatch, ImageDecoder};
-pub use live::LatestPair;
+pub use live::{LatestPair, PATIENCE, Taken};
 pub use mcap_stream::{McapStream, StreamEvent};
 pub use messages::{CalibrationMismatch, StatedCalibration};
 pub use pairing::PairAssembler;
@@ -96,7 +96,7 @@ pub struct StereoPair {
 /// A source of pairs.
 pub trait StereoSource: Send {
     /// The next pair; `None` when the source has ended. A live source waits at most
-    /// [`live::PATIENCE`](LatestPair) and then says [`SourceError::NoFrames`].
+    /// [`PATIENCE`] and then says [`SourceError::NoFrames`].
     ///
     /// # Errors
     /// [`SourceError`]; [`SourceError::is_fatal`] says whether to go on.

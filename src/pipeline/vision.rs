@@ -114,7 +114,8 @@ impl Vision {
             DetectionClass::Smoke => AlarmClass::Smoke,
             DetectionClass::NonFire => return None,
         };
-        let ranging = match self.ranger.range(pair, &Target { box_px: detection.box_px }) {
+        let target = Target { class: detection.class, box_px: detection.box_px };
+        let ranging = match self.ranger.range(pair, &target) {
             Ok(ranging) => ranging,
             Err(error) => {
                 counters.add("range", "failed");

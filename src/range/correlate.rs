@@ -1,10 +1,9 @@
-//! Matching one patch as a whole: normalised correlation over its pixels, then least squares below
-//! the pixel.
+//! Matching all pixels of a target as one: normalised correlation to the pixel, then least squares
+//! below it (Lucas and Kanade's step with gain, offset and robust weights).
 //!
 //! Semi-global matching pulls disparities towards whole pixels; this does not, and costs a
 //! thousandth. It gives one disparity for all pixels of the target.
 
-use super::pool::Sample;
 use nalgebra::{Matrix3, Vector3};
 
 /// An 8-bit gray image, row by row.
@@ -14,23 +13,12 @@ pub(super) struct Gray {
     pub values: Vec<f32>,
 }
 
-/// Disparities that are tried, whole pixels, both ends included.
+/// The best whole disparity.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Search {
-    pub least: i32,
-    pub greatest: i32,
-}
-
-/// The best match.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Match {
-    pub disparity_px: f64,
-    /// One sigma, from the residuals and the gradients that hold the match.
-    pub sigma_px: f64,
+pub(super) struct Peak {
+    pub disparity_px: i32,
     /// Normalised correlation there, -1..1.
     pub correlation: f64,
-    /// Best correlation elsewhere, beyond two pixels from the peak.
-    pub runner_up: f64,
 }
 
 impl Gray {
@@ -59,7 +47,7 @@ impl Gray {
 
 /// Normalised correlation of the left pixels with the right ones `disparity` to their left; `None`
 /// where one of them is flat or too few are in the image.
-pub(super) fn correlation(
+fn correlation(
     left: &Gray,
     right: &Gray,
     pixels: &[(i32, i32)],
@@ -86,26 +74,19 @@ pub(super) fn correlation(
         .then(|| (lr - l * r / n) / (spread_l * spread_r).sqrt())
 }
 
-/// Matches the pixels as one: the best whole disparity, then below the pixel.
-pub(super) fn correlate(
+/// The whole disparity within two pixels of `middle` at which all pixels together match best.
+pub(super) fn peak_near(
     left: &Gray,
     right: &Gray,
     pixels: &[(i32, i32)],
-    search: Search,
-) -> Option<Match> {
-    let scores: Vec<(i32, f64)> = (search.least..=search.greatest)
-        .filter_map(|d| Some((d, correlation(left, right, pixels, d)?)))
-        .collect();
-    let &(peak, correlation) = scores.iter().max_by(|a, b| a.1.total_cmp(&b.1))?;
-    let elsewhere = scores.iter().filter(|(d, _)| (d - peak).abs() > 2);
-    let runner_up = elsewhere.map(|(_, score)| *score).fold(-1.0, f64::max);
-    let (disparity_px, sigma_px) = refine(left, right, pixels, f64::from(peak))?;
-    Some(Match {
-        disparity_px,
-        sigma_px,
-        correlation,
-        runner_up,
-    })
+    middle: i32,
+) -> Option<Peak> {
+    (middle - 2..=middle + 2)
+        .filter_map(|disparity_px| {
+            let correlation = correlation(left, right, pixels, disparity_px)?;
+            Some(Peak { disparity_px, correlation })
+        })
+        .max_by(|a, b| a.correlation.total_cmp(&b.correlation))
 }
 
 /// Least squares for disparity, gain and offset of the right eye against the left, from a disparity
@@ -114,8 +95,9 @@ pub(super) fn refine(
     left: &Gray,
     right: &Gray,
     pixels: &[(i32, i32)],
-    start_px: f64,
+    start_px: i32,
 ) -> Option<(f64, f64)> {
+    let start_px = f64::from(start_px);
     let mut state = Vector3::new(start_px, 1.0, 0.0);
     let mut scale = f64::INFINITY;
     let mut sigma = f64::INFINITY;
@@ -184,7 +166,46 @@ fn robust_scale(mut residuals: Vec<f64>) -> f64 {
     (*median * 1.4826).max(0.3)
 }
 
-/// Where the samples are.
-pub(super) fn places(samples: &[Sample]) -> Vec<(i32, i32)> {
-    samples.iter().map(|sample| sample.at).collect()
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn wave(shift: f64) -> Gray {
+        let value = |k: i32| {
+            let (u, v) = (f64::from(k % 60) + shift, f64::from(k / 60));
+            (120.0 + 60.0 * (0.7 * u + 0.3 * v).sin() + 30.0 * (0.31 * u - v).cos()) as f32
+        };
+        Gray { width: 60, values: (0..60 * 20).map(value).collect() }
+    }
+
+    fn pixels() -> Vec<(i32, i32)> {
+        (0..20).flat_map(|row| (20..50).map(move |column| (column, row))).collect()
+    }
+
+    #[test]
+    fn a_shift_is_found_to_a_hundredth_of_a_pixel_whatever_gain_and_offset() {
+        for step in 0..8 {
+            let truth = 6.0 + 0.125 * f64::from(step);
+            let mut right = wave(truth);
+            for value in &mut right.values {
+                *value = 0.7 * *value + 20.0;
+            }
+            let peak = peak_near(&wave(0.0), &right, &pixels(), 7).unwrap();
+            assert!(peak.correlation > 0.9 && (f64::from(peak.disparity_px) - truth).abs() < 0.6);
+            let (found, sigma) = refine(&wave(0.0), &right, &pixels(), peak.disparity_px).unwrap();
+            assert!((found - truth).abs() < 0.01, "{found} {truth}");
+            assert!(sigma < 0.05, "{sigma}");
+        }
+    }
+
+    #[test]
+    fn a_flat_eye_has_no_peak() {
+        let flat = Gray { width: 60, values: vec![80.0; 60 * 20] };
+        assert_eq!(peak_near(&wave(0.0), &flat, &pixels(), 5), None);
+    }
+
+    #[test]
+    fn a_match_that_runs_away_is_none() {
+        assert_eq!(refine(&wave(0.0), &wave(9.0), &pixels(), 5).map(|found| found.0 > 6.5), None);
+    }
 }

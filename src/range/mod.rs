@@ -11,8 +11,9 @@
 //! Depth follows from the *mean disparity*; the mean of depths would be pulled outwards.
 //!
 //! **Known limits.** Flames have no surface: the disparity is that of their visible outline and
-//! texture. Smoke seldom has enough texture, and then there is [`Ranging::NoMatch`]. The sigma is
-//! that of matching alone: calibration's share stands in the rig.
+//! texture. What is matched in smoke is the ground that shows through it (on rendered plumes at 20 m
+//! the disparity came out a quarter too small), so smoke is always [`Ranging::NoMatch`]. The sigma
+//! is that of matching alone: calibration's share stands in the rig.
 
 mod correlate;
 mod mask;
@@ -25,7 +26,7 @@ mod tests;
 pub use mask::HsvMask;
 pub use sgbm::{MatchMethod, SgbmConfig, SgbmRanger};
 
-use crate::detect::BoxPx;
+use crate::detect::{BoxPx, DetectionClass};
 use emberfix_calib::RectifiedPixel;
 use emberfix_frames::ServiceTime;
 use opencv::core::Mat;
@@ -44,6 +45,8 @@ pub struct RawPair {
 /// What to range.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Target {
+    /// What it is: the ground behind shows through smoke, so only the rest is matched.
+    pub class: DetectionClass,
     /// Box in the raw left image.
     pub box_px: BoxPx,
 }

@@ -1,12 +1,13 @@
 //! Ranges a target: semi-global matching in its padded box, or correlation of the whole target.
 
-use super::correlate::{self, Gray, Search, correlate, correlation};
+use super::correlate::{Gray, peak_near, refine};
 use super::patch::{Cutter, Margins, Patch};
 use super::pool::{Pooled, Sample, pool};
 use super::{HsvMask, RangeError, Ranger, Ranging, RawPair, Target};
+use crate::detect::DetectionClass;
 use emberfix_calib::{RectifiedPixel, Rig};
 use opencv::calib3d::{StereoSGBM, StereoSGBM_MODE_SGBM};
-use opencv::core::{Mat, MatTraitConst, Ptr};
+use opencv::core::{Mat, MatTraitConst, Point, Ptr, Rect, Vec3b};
 use opencv::prelude::{MatTraitConstManual, StereoMatcherTrait};
 use serde::{Deserialize, Serialize};
 
@@ -143,6 +144,13 @@ pub struct SgbmRanger {
     reach: Reach,
 }
 
+/// Disparities that are tried, whole pixels, both ends included.
+#[derive(Debug, Clone, Copy)]
+struct Search {
+    least: i32,
+    greatest: i32,
+}
+
 /// What decides how far a disparity reaches.
 #[derive(Debug, Clone, Copy)]
 struct Reach {
@@ -224,21 +232,18 @@ impl SgbmRanger {
             return Ok(None);
         }
         let (left, right) = (gray(&patch.left_gray)?, gray(&patch.right_gray)?);
-        let pixels = correlate::places(samples);
+        let pixels: Vec<_> = samples.iter().map(|sample| sample.at).collect();
         let whole = pooled.disparity_px.round() as i32;
         // A disparity that the target as a whole does not bear out is a phantom.
-        if correlation(&left, &right, &pixels, whole).is_none_or(|c| c < config.min_correlation) {
+        let Some(peak) = peak_near(&left, &right, &pixels, whole)
+            .filter(|peak| peak.correlation >= config.min_correlation)
+        else {
             return Ok(None);
-        }
+        };
         let found = match config.method {
             MatchMethod::Sgbm => Some(Found::pooled(&pooled, config.block_px)),
-            MatchMethod::Correlate => correlate(&left, &right, &pixels, self.search)
-                .filter(|found| (found.disparity_px - pooled.disparity_px).abs() < 2.0)
-                .map(|found| Found {
-                    disparity_px: found.disparity_px,
-                    sigma_px: found.sigma_px,
-                    pooled,
-                }),
+            MatchMethod::Correlate => refine(&left, &right, &pixels, peak.disparity_px)
+                .map(|(disparity_px, sigma_px)| Found { disparity_px, sigma_px, pooled }),
         };
         Ok(found.map(|found| Found {
             sigma_px: found.sigma_px.max(config.sigma_floor_px),
@@ -270,7 +275,9 @@ impl Found {
 impl Ranger for SgbmRanger {
     fn range(&mut self, pair: &RawPair, target: &Target) -> Result<Ranging, RangeError> {
         self.cutter.check(pair)?;
-        let Some(right) = &pair.right_gray else {
+        let (DetectionClass::Fire | DetectionClass::NonFire, Some(right)) =
+            (target.class, &pair.right_gray)
+        else {
             return Ok(Ranging::NoMatch);
         };
         let margins = self.margins();
@@ -332,16 +339,58 @@ fn matcher(config: &SgbmConfig, least: i32) -> opencv::Result<Ptr<StereoSGBM>> {
     )
 }
 
-/// The flame's pixels in the target, or all of them where the gate leaves too few (smoke, or a
-/// flame in colours that the gate does not know).
+/// The flame's pixels in the target: those that the gate keeps and that outshine the surroundings.
+/// Where that leaves too few (dry grass is as yellow as flame), what the gate keeps; where that is
+/// too little as well (a thing in colours that the gate does not know), all of them.
 fn target_mask(patch: &Patch, config: &SgbmConfig) -> Result<Vec<bool>, RangeError> {
-    let mask = config.mask.apply(&patch.left_bgr.roi(patch.target)?)?;
-    let kept = mask.iter().filter(|kept| **kept).count();
-    Ok(if kept < config.min_support as usize {
-        vec![true; mask.len()]
-    } else {
-        mask
-    })
+    let target = patch.target;
+    let gate = config.mask.apply(&patch.left_bgr.roi(target)?)?;
+    let floor = brightness_around(patch, config.context_px as i32)?;
+    let shining: Vec<bool> = within(&patch.left_bgr, target)?
+        .zip(&gate)
+        .map(|(pixel, kept)| *kept && shine(pixel) > floor)
+        .collect();
+    let enough = |mask: &[bool]| {
+        mask.iter().filter(|kept| **kept).count() >= config.min_support as usize
+    };
+    Ok([shining, gate].into_iter().find(|mask| enough(mask)).unwrap_or_else(|| {
+        vec![true; (target.width * target.height) as usize]
+    }))
+}
+
+/// How much like flame a pixel shines: bright in red, weak in blue.
+fn shine(bgr: [u8; 3]) -> i32 {
+    2 * i32::from(bgr[2]) - i32::from(bgr[0])
+}
+
+/// Shine that hardly anything around the target exceeds.
+fn brightness_around(patch: &Patch, context: i32) -> opencv::Result<i32> {
+    let target = patch.target;
+    let left = (target.x - context).max(patch.seen_columns.0);
+    let right = (target.x + target.width + context).min(patch.seen_columns.1);
+    let around = Rect::new(left, 0, right - left, patch.left_bgr.rows());
+    let mut shines = Vec::new();
+    for (index, pixel) in (0..).zip(within(&patch.left_bgr, around)?) {
+        let at = Point::new(left + index % around.width, index / around.width);
+        if !target.contains(at) {
+            shines.push(shine(pixel));
+        }
+    }
+    if shines.is_empty() {
+        return Ok(i32::MIN);
+    }
+    let rank = shines.len() * 95 / 100;
+    Ok(*shines.select_nth_unstable(rank).1)
+}
+
+/// The pixels of a part of an 8-bit BGR image, row by row.
+fn within(image: &Mat, part: Rect) -> opencv::Result<impl Iterator<Item = [u8; 3]>> {
+    let mut rows = Vec::with_capacity(part.height as usize);
+    for row in part.y..part.y + part.height {
+        let pixels = image.at_row::<Vec3b>(row)?;
+        rows.push(&pixels[part.x as usize..(part.x + part.width) as usize]);
+    }
+    Ok(rows.into_iter().flatten().map(|pixel| pixel.0))
 }
 
 /// Patch columns and rows of the mask's pixels.

@@ -110,7 +110,7 @@ impl Scene {
             width: 2.0 * reach_u,
             height: 2.0 * reach_v,
         };
-        Target { box_px }
+        Target { class: DetectionClass::Fire, box_px }
     }
 }
 
@@ -274,6 +274,7 @@ fn boxes_beyond_the_image_are_no_match() {
     let pair = SCENE.pair();
     for (x, y) in [(-200.0, 10.0), (400.0, 10.0), (10.0, -90.0), (10.0, 300.0)] {
         let target = Target {
+            class: DetectionClass::Fire,
             box_px: BoxPx {
                 x,
                 y,
@@ -307,6 +308,14 @@ fn a_dead_dark_or_flat_right_eye_is_no_match() {
             .unwrap(),
         Ranging::NoMatch
     );
+}
+
+/// What matches in smoke is the ground behind it.
+#[test]
+fn smoke_is_no_match() {
+    let target = Target { class: DetectionClass::Smoke, ..SCENE.target() };
+    let found = ranger(MatchMethod::Correlate).range(&SCENE.pair(), &target).unwrap();
+    assert_eq!(found, Ranging::NoMatch);
 }
 
 #[test]

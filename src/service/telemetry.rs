@@ -58,6 +58,8 @@ pub struct Talk {
     timesync_due: ServiceTime,
     rates_due: ServiceTime,
     outbox_due: ServiceTime,
+    /// Alarms that can't be told this way, so that each is complained of once.
+    refused: BTreeMap<String, u32>,
 }
 
 impl Talk {
@@ -87,6 +89,7 @@ impl Talk {
             timesync_due: now,
             rates_due: now,
             outbox_due: now,
+            refused: BTreeMap::new(),
         }
     }
 
@@ -163,7 +166,8 @@ impl Talk {
             }));
             tracing::info!(system = system.0, "vehicle heard");
         }
-        if Some(system) == self.vehicle() {
+        // The ground agent may have a port of its own; whoever else is there is not talked to.
+        if Some(system) == self.vehicle() || received.frame.sender() == self.agent {
             self.link.accept_peer(from);
         }
     }
@@ -247,7 +251,10 @@ impl Talk {
         };
         for alarm in &pending {
             if let Err(error) = delivery.offer(alarm) {
-                tracing::warn!(%error, id = alarm.properties.id, "alarm not told over MAVLink");
+                let (id, revision) = (alarm.properties.id.clone(), alarm.properties.revision);
+                if self.refused.insert(id, revision) != Some(revision) {
+                    tracing::warn!(%error, id = alarm.properties.id, "alarm not told over MAVLink");
+                }
             }
         }
     }

@@ -83,7 +83,10 @@ impl StereoCamera {
         let enu_from_left = body.enu_from_body * self.body_from_left;
         let left_m = body.position_m + body.enu_from_body * self.lever_arm_m;
         match eye {
-            Eye::Left => EyePose { origin_m: left_m, enu_from_camera: enu_from_left },
+            Eye::Left => EyePose {
+                origin_m: left_m,
+                enu_from_camera: enu_from_left,
+            },
             Eye::Right => EyePose {
                 origin_m: left_m + enu_from_left * self.right_in_left_m,
                 enu_from_camera: enu_from_left * self.left_from_right,
@@ -102,8 +105,11 @@ impl EyePose {
 /// From the definition of the mount: the boresight stands `yaw` to the right of the nose and
 /// `depression` below it; then the camera is turned clockwise about it, seen from behind.
 fn body_from_camera(yaw: f64, depression: f64, roll: f64) -> Matrix3<f64> {
-    let boresight =
-        Vector3::new(depression.cos() * yaw.cos(), depression.cos() * yaw.sin(), depression.sin());
+    let boresight = Vector3::new(
+        depression.cos() * yaw.cos(),
+        depression.cos() * yaw.sin(),
+        depression.sin(),
+    );
     let level_right = Vector3::new(-yaw.sin(), yaw.cos(), 0.0);
     let level_down = boresight.cross(&level_right);
     // Clockwise from behind: what was right goes down, what was down goes left.
@@ -122,7 +128,11 @@ impl Lens {
             distortion: camera.distortion,
             farthest_r2: f64::INFINITY,
         };
-        let corner_r2 = lens.corners().map(|(x, y)| x * x + y * y).into_iter().fold(0.0, f64::max);
+        let corner_r2 = lens
+            .corners()
+            .map(|(x, y)| x * x + y * y)
+            .into_iter()
+            .fold(0.0, f64::max);
         lens.farthest_r2 = 1.5 * corner_r2;
         lens
     }
@@ -139,7 +149,10 @@ impl Lens {
             return None;
         }
         let (xd, yd) = self.distort(x, y);
-        Some((self.focal_px.0 * xd + self.centre_px.0, self.focal_px.1 * yd + self.centre_px.1))
+        Some((
+            self.focal_px.0 * xd + self.centre_px.0,
+            self.focal_px.1 * yd + self.centre_px.1,
+        ))
     }
 
     fn distort(&self, x: f64, y: f64) -> (f64, f64) {
@@ -176,6 +189,7 @@ impl Lens {
 
     pub(crate) fn holds(&self, (u, v): (f64, f64)) -> bool {
         // Pixel centres at whole numbers: an image begins half a pixel before the first.
-        (-0.5..self.width as f64 - 0.5).contains(&u) && (-0.5..self.height as f64 - 0.5).contains(&v)
+        (-0.5..self.width as f64 - 0.5).contains(&u)
+            && (-0.5..self.height as f64 - 0.5).contains(&v)
     }
 }

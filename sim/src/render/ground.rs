@@ -46,12 +46,22 @@ pub(super) struct RayGrid {
 
 impl RayGrid {
     pub(super) fn new(lens: &Lens) -> Self {
-        let (columns, rows) = (lens.width.div_ceil(BLOCK) + 1, lens.height.div_ceil(BLOCK) + 1);
+        let (columns, rows) = (
+            lens.width.div_ceil(BLOCK) + 1,
+            lens.height.div_ceil(BLOCK) + 1,
+        );
         let corner = |i: usize| {
-            lens.unproject(((i % columns) * BLOCK) as f64, ((i / columns) * BLOCK) as f64)
+            lens.unproject(
+                ((i % columns) * BLOCK) as f64,
+                ((i / columns) * BLOCK) as f64,
+            )
         };
         let tangents = (0..columns * rows).into_par_iter().map(corner).collect();
-        Self { tangents, columns, rows }
+        Self {
+            tangents,
+            columns,
+            rows,
+        }
     }
 
     fn tangents(&self, column: usize, row: usize) -> (f64, f64) {
@@ -149,7 +159,11 @@ impl<'a> Ground<'a> {
             ray: [ray.x as f32, ray.y as f32, ray.z as f32],
             ..Node::default()
         };
-        let Some(depth) = self.world.terrain().hit(&self.pose.origin_m, &ray, FARTHEST_M) else {
+        let Some(depth) = self
+            .world
+            .terrain()
+            .hit(&self.pose.origin_m, &ray, FARTHEST_M)
+        else {
             return node;
         };
         let at = self.pose.origin_m + ray * depth;
@@ -202,10 +216,17 @@ impl<'a> Ground<'a> {
     fn block(&self, band: &mut Band, column: usize, row: usize) {
         let first = row * self.grid.columns + column;
         let second = first + self.grid.columns;
-        let corners =
-            [self.nodes[first], self.nodes[first + 1], self.nodes[second], self.nodes[second + 1]];
+        let corners = [
+            self.nodes[first],
+            self.nodes[first + 1],
+            self.nodes[second],
+            self.nodes[second + 1],
+        ];
         let nearest = corners.iter().map(|n| n.inv_depth).fold(0.0, f32::max);
-        let farthest = corners.iter().map(|n| n.inv_depth).fold(f32::INFINITY, f32::min);
+        let farthest = corners
+            .iter()
+            .map(|n| n.inv_depth)
+            .fold(f32::INFINITY, f32::min);
         // A crest or the horizon runs through: every pixel for itself.
         let broken = nearest > 0.0 && farthest < 0.7 * nearest;
         if broken {
@@ -224,8 +245,10 @@ impl<'a> Ground<'a> {
         let columns = BLOCK.min(band.width - left);
         for row in 0..band.rows {
             let down = row as f32 / BLOCK as f32;
-            let (start, end) =
-                (between(&corners[0], &corners[2], down), between(&corners[1], &corners[3], down));
+            let (start, end) = (
+                between(&corners[0], &corners[2], down),
+                between(&corners[1], &corners[3], down),
+            );
             let offset = row * band.width + left;
             for k in 0..columns {
                 let at = between(&start, &end, k as f32 / BLOCK as f32);
@@ -239,8 +262,10 @@ impl<'a> Ground<'a> {
         let left = column * BLOCK;
         for row in 0..band.rows {
             let down = row as f32 / BLOCK as f32;
-            let (start, end) =
-                (between(&corners[0], &corners[2], down), between(&corners[1], &corners[3], down));
+            let (start, end) = (
+                between(&corners[0], &corners[2], down),
+                between(&corners[1], &corners[3], down),
+            );
             for k in 0..BLOCK.min(band.width - left) {
                 let at = between(&start, &end, k as f32 / BLOCK as f32);
                 band.colour[row * band.width + left + k] = self.sky(&at.ray);
@@ -268,7 +293,8 @@ impl<'a> Ground<'a> {
 
     /// Ground that a pixel sees at a grazing angle, metres.
     fn grazing_footprint(&self, node: &Node) -> f32 {
-        let across = (self.grid.tangents(1, 0).0 - self.grid.tangents(0, 0).0) as f32 / BLOCK as f32;
+        let across =
+            (self.grid.tangents(1, 0).0 - self.grid.tangents(0, 0).0) as f32 / BLOCK as f32;
         3.0 * across / node.inv_depth
     }
 
@@ -296,8 +322,12 @@ impl<'a> Ground<'a> {
     fn marks_under(&self, corners: &[Node; 4]) -> Vec<LocalMark> {
         let place = |n: &Node| (n.ray[0] / n.inv_depth, n.ray[1] / n.inv_depth);
         let places = corners.map(|n| place(&n));
-        let low = places.iter().fold((f32::MAX, f32::MAX), |l, p| (l.0.min(p.0), l.1.min(p.1)));
-        let high = places.iter().fold((f32::MIN, f32::MIN), |h, p| (h.0.max(p.0), h.1.max(p.1)));
+        let low = places
+            .iter()
+            .fold((f32::MAX, f32::MAX), |l, p| (l.0.min(p.0), l.1.min(p.1)));
+        let high = places
+            .iter()
+            .fold((f32::MIN, f32::MIN), |h, p| (h.0.max(p.0), h.1.max(p.1)));
         let (east, north) = (self.pose.origin_m.x, self.pose.origin_m.y);
         let mut local = Vec::new();
         self.marks.within(
@@ -313,11 +343,20 @@ impl<'a> Ground<'a> {
             },
         );
         local.extend(self.glows.iter().filter_map(|glow| {
-            let (e, n) = ((glow.centre_m.x - east) as f32, (glow.centre_m.y - north) as f32);
+            let (e, n) = (
+                (glow.centre_m.x - east) as f32,
+                (glow.centre_m.y - north) as f32,
+            );
             let reach = 4.0 * glow.radius_m as f32;
-            let near = e > low.0 - reach && e < high.0 + reach && n > low.1 - reach && n < high.1 + reach;
+            let near =
+                e > low.0 - reach && e < high.0 + reach && n > low.1 - reach && n < high.1 + reach;
             let inv_radius = (1.0 / glow.radius_m) as f32;
-            near.then_some(LocalMark { effect: Effect::Glow(glow.strength), east: e, north: n, inv_radius })
+            near.then_some(LocalMark {
+                effect: Effect::Glow(glow.strength),
+                east: e,
+                north: n,
+                inv_radius,
+            })
         }));
         local
     }
@@ -340,7 +379,11 @@ impl<'a> Ground<'a> {
             mark.apply(east, north, middle[1] * UNIT, &mut albedo, &mut light, self);
         }
         let colour = std::array::from_fn(|c| albedo[c] * light[c]);
-        if at.haze < 0.004 { colour } else { mix(colour, self.haze_colour(), at.haze) }
+        if at.haze < 0.004 {
+            colour
+        } else {
+            mix(colour, self.haze_colour(), at.haze)
+        }
     }
 
     fn haze_colour(&self) -> Rgb {
@@ -362,7 +405,8 @@ impl<'a> Ground<'a> {
         let cover = ((cloud - 0.95) * 1.6).clamp(0.0, 0.8) * (4.0 * elevation).min(1.0);
         colour = mix(colour, grey.map(|c| 1.15 * c), cover);
         let towards =
-            (ray[0] * self.sun.x as f32 + ray[1] * self.sun.y as f32 + ray[2] * self.sun.z as f32) / length;
+            (ray[0] * self.sun.x as f32 + ray[1] * self.sun.y as f32 + ray[2] * self.sun.z as f32)
+                / length;
         let glare = clear * (towards.max(0.0).powi(64) * 0.8 + towards.max(0.0).powi(4096) * 60.0);
         std::array::from_fn(|c| colour[c] + glare * [1.0, 0.93, 0.8, 0.93][c])
     }
@@ -372,7 +416,12 @@ impl<'a> Ground<'a> {
         let sun = normal.dot(&self.sun.cast::<f32>()).max(0.0);
         let sky = 0.6 + 0.4 * normal.z;
         let light = |c: usize| gain * (self.sunlight[c] * sun + self.skylight[c] * sky);
-        [albedo[0] * light(0), albedo[1] * light(1), albedo[2] * light(2), albedo[1] * light(1)]
+        [
+            albedo[0] * light(0),
+            albedo[1] * light(1),
+            albedo[2] * light(2),
+            albedo[1] * light(1),
+        ]
     }
 
     pub(super) fn world(&self) -> &World {
@@ -399,8 +448,19 @@ enum Effect {
 
 impl LocalMark {
     /// `ragged` is about one and wanders from place to place.
-    fn apply(&self, east: f32, north: f32, ragged: f32, albedo: &mut Rgb, light: &mut Rgb, ground: &Ground) {
-        let (de, dn) = ((east - self.east) * self.inv_radius, (north - self.north) * self.inv_radius);
+    fn apply(
+        &self,
+        east: f32,
+        north: f32,
+        ragged: f32,
+        albedo: &mut Rgb,
+        light: &mut Rgb,
+        ground: &Ground,
+    ) {
+        let (de, dn) = (
+            (east - self.east) * self.inv_radius,
+            (north - self.north) * self.inv_radius,
+        );
         let r2 = de * de + dn * dn;
         let inside = ((1.15 - r2 + 0.8 * (ragged - 1.0)) / 0.45).clamp(0.0, 1.0);
         match self.effect {
@@ -409,7 +469,9 @@ impl LocalMark {
                 *light = std::array::from_fn(|c| light[c] + glow * [3.2, 1.2, 0.25, 1.2][c]);
             }
             Effect::Mark(MarkKind::Shadow) => {
-                let shaded: Rgb = std::array::from_fn(|c| ground.skylight[c] + 0.12 * (light[c] - ground.skylight[c]));
+                let shaded: Rgb = std::array::from_fn(|c| {
+                    ground.skylight[c] + 0.12 * (light[c] - ground.skylight[c])
+                });
                 *light = mix(*light, shaded, inside);
             }
             Effect::Mark(MarkKind::Scorch) => {

@@ -1,9 +1,9 @@
 //! Where fire and smoke are seen in the left image: boxes for training and for scoring.
 
+use super::PixelBox;
 use super::camera::{EyePose, Lens};
 use super::solids::Solids;
 use super::splats::{SeenSplat, billows, ray_to};
-use super::PixelBox;
 use crate::world::{Burning, BurningClass, Splat, SplatKind, World};
 
 /// A fire or smoke that the left eye sees.
@@ -72,7 +72,13 @@ pub(super) fn label(
     })
 }
 
-fn is_free(splat: &Splat, seen: &SeenSplat, world: &World, pose: &EyePose, solids: &Solids) -> bool {
+fn is_free(
+    splat: &Splat,
+    seen: &SeenSplat,
+    world: &World,
+    pose: &EyePose,
+    solids: &Solids,
+) -> bool {
     let ray = ray_to(splat, pose);
     let behind_hill = world.terrain().hit(&pose.origin_m, &ray, 0.98).is_some();
     !behind_hill && !solids.hide(seen.tangents, 0.99 * seen.depth_m)
@@ -81,7 +87,9 @@ fn is_free(splat: &Splat, seen: &SeenSplat, world: &World, pose: &EyePose, solid
 /// Edges of the pixels where the splats together hold back at least `alpha`.
 fn opaque_extent(splats: &[SeenSplat], world: &World, alpha: f32) -> Option<(f64, f64, f64, f64)> {
     let (first, rest) = splats.split_first()?;
-    let area = rest.iter().fold(first.extent, |area, splat| area.with(&splat.extent));
+    let area = rest
+        .iter()
+        .fold(first.extent, |area, splat| area.with(&splat.extent));
     let step = (area.columns().max(area.rows()) / RASTER_PX).max(1);
     let (columns, rows) = (area.columns().div_ceil(step), area.rows().div_ceil(step));
     let mut clear = vec![1.0_f32; columns * rows];
@@ -90,14 +98,23 @@ fn opaque_extent(splats: &[SeenSplat], world: &World, alpha: f32) -> Option<(f64
         darken(&mut clear, columns, &area, step, splat, &billows);
     }
     let (mut low, mut high) = ((usize::MAX, usize::MAX), (0, 0));
-    for (k, _) in clear.iter().enumerate().filter(|(_, clear)| **clear < 1.0 - alpha) {
+    for (k, _) in clear
+        .iter()
+        .enumerate()
+        .filter(|(_, clear)| **clear < 1.0 - alpha)
+    {
         let (x, y) = (k % columns, k / columns);
         low = (low.0.min(x), low.1.min(y));
         high = (high.0.max(x + 1), high.1.max(y + 1));
     }
     let edge = |start: usize, cells: usize| (start + cells * step) as f64 - 0.5;
     (low.0 < high.0).then(|| {
-        (edge(area.left, low.0), edge(area.top, low.1), edge(area.left, high.0), edge(area.top, high.1))
+        (
+            edge(area.left, low.0),
+            edge(area.top, low.1),
+            edge(area.left, high.0),
+            edge(area.top, high.1),
+        )
     })
 }
 
@@ -110,7 +127,9 @@ fn darken(
     splat: &SeenSplat,
     billows: &crate::world::Lod,
 ) {
-    let range = |low: usize, high: usize, start: usize| (low - start).div_ceil(step)..=(high - 1 - start) / step;
+    let range = |low: usize, high: usize, start: usize| {
+        (low - start).div_ceil(step)..=(high - 1 - start) / step
+    };
     for row in range(splat.extent.top, splat.extent.bottom, area.top) {
         for column in range(splat.extent.left, splat.extent.right, area.left) {
             let cover = splat.cover(area.left + column * step, area.top + row * step, billows);

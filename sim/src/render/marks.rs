@@ -20,7 +20,10 @@ impl MarkGrid {
         for mark in marks {
             // Ragged edges reach a little beyond the radius.
             let reach = 1.3 * mark.radius_m;
-            let (low, high) = (mark.centre_m.add_scalar(-reach), mark.centre_m.add_scalar(reach));
+            let (low, high) = (
+                mark.centre_m.add_scalar(-reach),
+                mark.centre_m.add_scalar(reach),
+            );
             for cell in cells((low.x, low.y), (high.x, high.y)) {
                 grid.cells.entry(cell).or_default().push(*mark);
             }
@@ -48,7 +51,10 @@ impl MarkGrid {
 fn first_shared(mark: &Mark, low: (f64, f64)) -> (i64, i64) {
     let reach = 1.3 * mark.radius_m;
     let (east, north) = (mark.centre_m.x - reach, mark.centre_m.y - reach);
-    (index(east).max(index(low.0)), index(north).max(index(low.1)))
+    (
+        index(east).max(index(low.0)),
+        index(north).max(index(low.1)),
+    )
 }
 
 fn cells(low: (f64, f64), high: (f64, f64)) -> impl Iterator<Item = (i64, i64)> {
@@ -68,9 +74,17 @@ mod tests {
 
     #[test]
     fn a_mark_over_many_cells_is_met_once() {
-        let mark = Mark { kind: MarkKind::Shadow, centre_m: Vector2::new(3.0, -9.0), radius_m: 20.0 };
+        let mark = Mark {
+            kind: MarkKind::Shadow,
+            centre_m: Vector2::new(3.0, -9.0),
+            radius_m: 20.0,
+        };
         let grid = MarkGrid::new(&[mark]);
-        for (low, high) in [((-30.0, -40.0), (29.0, 19.0)), ((1.0, -9.0), (2.0, -7.0)), ((7.0, 7.0), (9.0, 9.0))] {
+        for (low, high) in [
+            ((-30.0, -40.0), (29.0, 19.0)),
+            ((1.0, -9.0), (2.0, -7.0)),
+            ((7.0, 7.0), (9.0, 9.0)),
+        ] {
             let mut met = 0;
             grid.within(low, high, |_| met += 1);
             assert_eq!(met, 1, "{low:?}");

@@ -53,7 +53,13 @@ pub struct RenderConfig {
 
 impl Default for RenderConfig {
     fn default() -> Self {
-        Self { seed: 0, noise_sigma_dn: 2.0, exposure: 1.0, right_gain: 1.04, vignetting: 0.25 }
+        Self {
+            seed: 0,
+            noise_sigma_dn: 2.0,
+            exposure: 1.0,
+            right_gain: 1.04,
+            vignetting: 0.25,
+        }
     }
 }
 
@@ -95,7 +101,13 @@ impl Renderer {
     pub fn new(world: Arc<World>, camera: StereoCamera, config: RenderConfig) -> Self {
         let rays = [Eye::Left, Eye::Right].map(|eye| RayGrid::new(camera.lens(eye)));
         let marks = MarkGrid::new(&world.things().marks);
-        Self { world, camera, sensor: Sensor::new(config), rays, marks }
+        Self {
+            world,
+            camera,
+            sensor: Sensor::new(config),
+            rays,
+            marks,
+        }
     }
 
     /// The world that it draws.
@@ -114,14 +126,26 @@ impl Renderer {
         let exposure = self.sensor.exposure(eye, t_s);
         let channels = eye.channels();
         let mut bytes = vec![0; lens.width * lens.height * channels];
-        bytes.par_chunks_mut(BLOCK * lens.width * channels).enumerate().for_each(|(row, out)| {
-            let mut band = ground.band(row, lens.width, lens.height);
-            solids.draw(&mut band, &ground);
-            self.draw_splats(&mut band, &splats);
-            self.sensor.develop(&band, lens.height, exposure, out);
-        });
-        let format = if channels == 3 { PixelFormat::Bgr8 } else { PixelFormat::Mono8 };
-        Frame { width: lens.width as u32, height: lens.height as u32, format, bytes }
+        bytes
+            .par_chunks_mut(BLOCK * lens.width * channels)
+            .enumerate()
+            .for_each(|(row, out)| {
+                let mut band = ground.band(row, lens.width, lens.height);
+                solids.draw(&mut band, &ground);
+                self.draw_splats(&mut band, &splats);
+                self.sensor.develop(&band, lens.height, exposure, out);
+            });
+        let format = if channels == 3 {
+            PixelFormat::Bgr8
+        } else {
+            PixelFormat::Mono8
+        };
+        Frame {
+            width: lens.width as u32,
+            height: lens.height as u32,
+            format,
+            bytes,
+        }
     }
 
     /// Raw pixel of a point (east, north, up, metres), with distortion; `None` behind the camera and
@@ -136,7 +160,10 @@ impl Renderer {
     /// Boxes of the fire and smoke that the left eye sees, one per fire and class.
     #[must_use]
     pub fn label_boxes(&self, body: &BodyState, t_s: f64) -> Vec<LabelBox> {
-        let (lens, pose) = (self.camera.lens(Eye::Left), self.camera.pose(Eye::Left, body));
+        let (lens, pose) = (
+            self.camera.lens(Eye::Left),
+            self.camera.pose(Eye::Left, body),
+        );
         let solids = Solids::new(self.world.things(), &pose, lens);
         let label = |burning: &Burning| labels::label(burning, &self.world, &pose, lens, &solids);
         self.world.burning(t_s).iter().filter_map(label).collect()
@@ -153,7 +180,11 @@ impl Renderer {
         let things = self.world.things();
         let sun = self.world.sun();
         let bright = self.world.light().sun > 0.3;
-        let burning = self.world.burning(t_s).into_iter().flat_map(|burning| burning.splats);
+        let burning = self
+            .world
+            .burning(t_s)
+            .into_iter()
+            .flat_map(|burning| burning.splats);
         let glints = things.glints.iter().filter(move |_| bright);
         let glints = glints.flat_map(move |glint| glint.splats(&pose.origin_m, &sun, t_s));
         burning.chain(glints).chain(things.lights.iter().copied())
@@ -191,9 +222,11 @@ impl Frame {
     pub fn rgb(&self) -> Vec<u8> {
         match self.format {
             PixelFormat::Mono8 => self.bytes.iter().flat_map(|grey| [*grey; 3]).collect(),
-            PixelFormat::Bgr8 => {
-                self.bytes.chunks_exact(3).flat_map(|p| [p[2], p[1], p[0]]).collect()
-            }
+            PixelFormat::Bgr8 => self
+                .bytes
+                .chunks_exact(3)
+                .flat_map(|p| [p[2], p[1], p[0]])
+                .collect(),
         }
     }
 }

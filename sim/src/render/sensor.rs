@@ -1,7 +1,7 @@
 //! From light to the bytes of a camera: gain, vignetting, shot noise, gamma.
 
-use super::ground::Band;
 use super::RenderConfig;
+use super::ground::Band;
 use crate::world::hash;
 use emberfix_calib::Eye;
 use rand::SeedableRng;
@@ -37,9 +37,17 @@ pub(super) struct Exposure {
 impl Sensor {
     pub(super) fn new(config: RenderConfig) -> Self {
         let mut rng = ChaCha8Rng::seed_from_u64(config.seed);
-        let deviates = (0..DEVIATES).map(|_| StandardNormal.sample(&mut rng)).collect();
-        let curve = (0..CURVE).map(|k| response(k as f32 / (CURVE - 1) as f32, &config)).collect();
-        Self { config, curve, deviates }
+        let deviates = (0..DEVIATES)
+            .map(|_| StandardNormal.sample(&mut rng))
+            .collect();
+        let curve = (0..CURVE)
+            .map(|k| response(k as f32 / (CURVE - 1) as f32, &config))
+            .collect();
+        Self {
+            config,
+            curve,
+            deviates,
+        }
     }
 
     pub(super) fn exposure(&self, eye: Eye, t_s: f64) -> Exposure {
@@ -48,7 +56,11 @@ impl Sensor {
             Eye::Right => (2, self.config.right_gain),
         };
         let seed = hash(self.config.seed ^ t_s.to_bits(), own, 0xC0DE);
-        Exposure { eye, seed, gain: (self.config.exposure * gain) as f32 }
+        Exposure {
+            eye,
+            seed,
+            gain: (self.config.exposure * gain) as f32,
+        }
     }
 
     /// Bytes of a band: blue, green, red for the left eye, one for the right.
@@ -61,7 +73,11 @@ impl Sensor {
             let dy = py as f32 - height as f32 / 2.0;
             let line = &band.colour[row * band.width..(row + 1) * band.width];
             let bytes = &mut out[row * band.width * channels..(row + 1) * band.width * channels];
-            for (px, (colour, pixel)) in line.iter().zip(bytes.chunks_exact_mut(channels)).enumerate() {
+            for (px, (colour, pixel)) in line
+                .iter()
+                .zip(bytes.chunks_exact_mut(channels))
+                .enumerate()
+            {
                 let dx = px as f32 - band.width as f32 / 2.0;
                 let falloff = 1.0 - self.config.vignetting as f32 * (dx * dx + dy * dy) / corner2;
                 bits = xorshift(bits);

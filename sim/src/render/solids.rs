@@ -39,8 +39,16 @@ pub(super) struct Solids {
 impl Solids {
     pub(super) fn new(things: &Things, pose: &EyePose, lens: &Lens) -> Self {
         Self {
-            balls: things.balls.iter().filter_map(|ball| see_ball(pose, lens, ball)).collect(),
-            quads: things.quads.iter().filter_map(|quad| see_quad(pose, lens, quad)).collect(),
+            balls: things
+                .balls
+                .iter()
+                .filter_map(|ball| see_ball(pose, lens, ball))
+                .collect(),
+            quads: things
+                .quads
+                .iter()
+                .filter_map(|quad| see_quad(pose, lens, quad))
+                .collect(),
             focal_px: lens.focal_px.0 as f32,
         }
     }
@@ -100,7 +108,10 @@ impl Solids {
                 return;
             }
             let footprint = 1.0 / (hit.z * self.focal_px);
-            let patina = grain.lod(footprint).at(2.0 * long * along, 2.0 * wide * across)[1] * UNIT;
+            let patina = grain
+                .lod(footprint)
+                .at(2.0 * long * along, 2.0 * wide * across)[1]
+                * UNIT;
             let gain = (0.6 + 0.4 * patina) * rows_gain(quad.rows, across, wide, footprint);
             band.inv_depth[offset] = hit.z;
             band.colour[offset] = ground.lit(&seen.normal, &quad.albedo, gain);
@@ -156,9 +167,15 @@ fn see_ball(pose: &EyePose, lens: &Lens, ball: &Ball) -> Option<SeenBall> {
     let middle = lens.project(&centre)?;
     let tangent2 = (centre.x.powi(2) + centre.y.powi(2)) / centre.z.powi(2);
     // Off the axis a ball's image is stretched outwards.
-    let reach = lens.focal_px.0 * ball.radius_m / (centre.z - ball.radius_m) * (1.0 + tangent2) + 2.0;
+    let reach =
+        lens.focal_px.0 * ball.radius_m / (centre.z - ball.radius_m) * (1.0 + tangent2) + 2.0;
     let extent = PixelBox::around(middle, (reach, reach), lens)?;
-    Some(SeenBall { extent, centre: centre.cast(), phase: ball.centre_m.x.fract() as f32, ball: *ball })
+    Some(SeenBall {
+        extent,
+        centre: centre.cast(),
+        phase: ball.centre_m.x.fract() as f32,
+        ball: *ball,
+    })
 }
 
 fn see_quad(pose: &EyePose, lens: &Lens, quad: &Quad) -> Option<SeenQuad> {
@@ -166,7 +183,12 @@ fn see_quad(pose: &EyePose, lens: &Lens, quad: &Quad) -> Option<SeenQuad> {
     let along = pose.enu_from_camera.tr_mul(&quad.along_m);
     let across = pose.enu_from_camera.tr_mul(&quad.across_m);
     let mut extent: Option<Reach> = None;
-    for place in [corner, corner + along, corner + across, corner + along + across] {
+    for place in [
+        corner,
+        corner + along,
+        corner + across,
+        corner + along + across,
+    ] {
         if place.z < NEAREST_M || place.z > FARTHEST_M {
             return None;
         }
@@ -175,7 +197,11 @@ fn see_quad(pose: &EyePose, lens: &Lens, quad: &Quad) -> Option<SeenQuad> {
     }
     let from_ray = Matrix3::from_columns(&[along, across, corner]).try_inverse()?;
     let normal = quad.along_m.cross(&quad.across_m).normalize();
-    let facing = if normal.dot(&(quad.corner_m - pose.origin_m)) > 0.0 { -normal } else { normal };
+    let facing = if normal.dot(&(quad.corner_m - pose.origin_m)) > 0.0 {
+        -normal
+    } else {
+        normal
+    };
     Some(SeenQuad {
         extent: extent?.clipped(lens)?,
         from_ray: from_ray.cast(),

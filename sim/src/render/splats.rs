@@ -1,8 +1,8 @@
 //! Flames, smoke and lamps in an eye's image.
 
 use super::PixelBox;
-use super::camera::Lens;
 use super::camera::EyePose;
+use super::camera::Lens;
 use super::ground::Band;
 use crate::world::{Lod, Splat, SplatKind, Textures, UNIT};
 use nalgebra::Vector3;
@@ -58,7 +58,11 @@ impl SeenSplat {
             middle_px: (middle.0 as f32, middle.1 as f32),
             long_per_px: ((axis.0 / drawn_long) as f32, (axis.1 / drawn_long) as f32),
             wide_per_px: ((-axis.1 / drawn_wide) as f32, (axis.0 / drawn_wide) as f32),
-            colour: if splat.kind == SplatKind::Light { splat.colour.map(|c| c * fade) } else { splat.colour },
+            colour: if splat.kind == SplatKind::Light {
+                splat.colour.map(|c| c * fade)
+            } else {
+                splat.colour
+            },
             opacity: splat.opacity * fade,
             billow: splat.billow,
         })
@@ -78,7 +82,8 @@ impl SeenSplat {
         if self.kind == SplatKind::Light {
             return kernel;
         }
-        let torn = billows.at(self.billow.0 + 0.22 * across, self.billow.1 - 0.22 * along)[1] * UNIT;
+        let torn =
+            billows.at(self.billow.0 + 0.22 * across, self.billow.1 - 0.22 * along)[1] * UNIT;
         // Soot shines in filaments with gaps between them.
         kernel * torn * torn * torn.min(1.4)
     }
@@ -126,7 +131,11 @@ fn shape(splat: &Splat, middle: (f64, f64), tip: (f64, f64), scale: f64) -> (f64
     // Seen end on, an ellipsoid shows its width.
     let end_on = (1.0 - (seen / full).powi(2)).clamp(0.0, 1.0);
     let long = (seen * seen + wide * wide * end_on).sqrt();
-    let axis = if seen > 1e-6 { (du / seen, dv / seen) } else { (0.0, -1.0) };
+    let axis = if seen > 1e-6 {
+        (du / seen, dv / seen)
+    } else {
+        (0.0, -1.0)
+    };
     (long, wide, axis)
 }
 
@@ -136,8 +145,9 @@ pub(super) fn seen(
     pose: &EyePose,
     lens: &Lens,
 ) -> Vec<SeenSplat> {
-    let mut seen: Vec<SeenSplat> =
-        splats.filter_map(|splat| SeenSplat::new(&splat, pose, lens)).collect();
+    let mut seen: Vec<SeenSplat> = splats
+        .filter_map(|splat| SeenSplat::new(&splat, pose, lens))
+        .collect();
     seen.sort_by(|a, b| b.depth_m.total_cmp(&a.depth_m));
     seen
 }

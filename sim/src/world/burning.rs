@@ -55,7 +55,9 @@ impl Flame {
     /// faster it is.
     pub(crate) fn flicker(&self) -> f64 {
         let puffing = 1.5 / self.width_m.max(0.1).sqrt();
-        let tones = [0.4, 1.0, 2.3, 3.9, 5.7, 8.1, 10.7, 13.9].iter().enumerate();
+        let tones = [0.4, 1.0, 2.3, 3.9, 5.7, 8.1, 10.7, 13.9]
+            .iter()
+            .enumerate();
         let sum: f64 = tones
             .map(|(k, tone)| {
                 let frequency = tone * puffing.clamp(0.8, 1.1);
@@ -116,7 +118,11 @@ impl Flame {
         let s = (f64::from(step) + 0.5) / f64::from(STEPS);
         let reach = self.reach(tongue);
         // Gaps travel upwards: the tip tears off.
-        let torn = wander(self.seed, 40 + tongue, 2.2 * s - self.rise_rate() * self.t_s);
+        let torn = wander(
+            self.seed,
+            40 + tongue,
+            2.2 * s - self.rise_rate() * self.t_s,
+        );
         if s > 0.45 && torn < 1.6 * (s - 0.45) - 0.55 {
             return None;
         }
@@ -130,13 +136,17 @@ impl Flame {
         let centre = Vector3::new(
             spread * x + sway.x + lean.x,
             spread * y + sway.y + lean.y,
-            height.max(0.6 * half_height),
+            height.max(0.85 * half_height),
         );
         let heat = self.flicker() * self.temper() * (1.15 - 0.75 * s) * (0.75 + 0.35 * torn);
         Some(Splat {
             kind: SplatKind::Flame,
             centre_m: self.base_m + centre,
-            half_axis_m: Vector3::new(0.12 * sway.x + lean.x / 6.0, 0.12 * sway.y + lean.y / 6.0, half_height),
+            half_axis_m: Vector3::new(
+                0.12 * sway.x + lean.x / 6.0,
+                0.12 * sway.y + lean.y / 6.0,
+                half_height,
+            ),
             half_width_m: half_width,
             colour: scaled(blend(HOT, COOL, (1.25 * s).min(1.0)), heat),
             opacity: (0.62 - 0.25 * s) as f32,
@@ -249,7 +259,10 @@ impl Plume {
             half_width_m: radius,
             colour: scaled(self.colour, shade),
             opacity: opacity as f32,
-            billow: (unit(own, k, 8) as f32, (unit(own, k, 9) - 0.05 * self.t_s).rem_euclid(1.0) as f32),
+            billow: (
+                unit(own, k, 8) as f32,
+                (unit(own, k, 9) - 0.05 * self.t_s).rem_euclid(1.0) as f32,
+            ),
         })
     }
 }
@@ -291,7 +304,10 @@ mod tests {
         for k in 0..60 {
             for splat in flame(f64::from(k) * 0.1).splats() {
                 let lowest = splat.centre_m.z - splat.half_axis_m.z;
-                assert!(lowest > 5.0 - 0.12, "a splat hangs {lowest} m under the base");
+                assert!(
+                    lowest > 5.0 - 0.12,
+                    "a splat hangs {lowest} m under the base"
+                );
                 tallest = tallest.max(splat.centre_m.z - 5.0);
             }
         }
@@ -300,12 +316,23 @@ mod tests {
 
     #[test]
     fn a_flame_changes_from_frame_to_frame_and_repeats_for_one_time() {
-        let places = |t| flame(t).splats().iter().map(|s| s.centre_m).collect::<Vec<_>>();
+        let places = |t| {
+            flame(t)
+                .splats()
+                .iter()
+                .map(|s| s.centre_m)
+                .collect::<Vec<_>>()
+        };
         assert_eq!(places(1.0), places(1.0));
         assert_ne!(places(1.0), places(1.1));
-        let brightness: Vec<f64> = (0..300).map(|k| flame(f64::from(k) / 30.0).flicker()).collect();
+        let brightness: Vec<f64> = (0..300)
+            .map(|k| flame(f64::from(k) / 30.0).flicker())
+            .collect();
         let mean = brightness.iter().sum::<f64>() / 300.0;
         let sigma = (brightness.iter().map(|b| (b - mean).powi(2)).sum::<f64>() / 300.0).sqrt();
-        assert!((0.9..1.1).contains(&mean) && (0.08..0.3).contains(&sigma), "{mean} {sigma}");
+        assert!(
+            (0.9..1.1).contains(&mean) && (0.08..0.3).contains(&sigma),
+            "{mean} {sigma}"
+        );
     }
 }

@@ -171,7 +171,13 @@ pub struct TreesConfig {
 
 impl Default for TreesConfig {
     fn default() -> Self {
-        Self { count: 0, seed: 1, height_m: 5.0, spread_m: 150.0, clearance_m: 6.0 }
+        Self {
+            count: 0,
+            seed: 1,
+            height_m: 5.0,
+            spread_m: 150.0,
+            clearance_m: 6.0,
+        }
     }
 }
 
@@ -215,6 +221,9 @@ pub struct WindConfig {
 
 impl Default for WindConfig {
     fn default() -> Self {
-        Self { east_m_s: 1.0, north_m_s: 0.5 }
+        Self {
+            east_m_s: 1.0,
+            north_m_s: 0.5,
+        }
     }
 }

@@ -177,8 +177,10 @@ impl World {
 
     /// Towards the sun, unit length.
     pub(crate) fn sun(&self) -> Vector3<f64> {
-        let (az, el) =
-            (self.light.sun_azimuth_deg.to_radians(), self.light.sun_elevation_deg.to_radians());
+        let (az, el) = (
+            self.light.sun_azimuth_deg.to_radians(),
+            self.light.sun_elevation_deg.to_radians(),
+        );
         Vector3::new(az.sin() * el.cos(), az.cos() * el.cos(), el.sin())
     }
 
@@ -188,11 +190,19 @@ impl World {
         for (fire, truth) in self.fires.iter().enumerate() {
             if let Some(flame) = self.flame(fire, t_s) {
                 let splats = flame.splats();
-                clouds.push(Burning { fire, class: BurningClass::Fire, splats });
+                clouds.push(Burning {
+                    fire,
+                    class: BurningClass::Fire,
+                    splats,
+                });
             }
             if let Some(plume) = self.plume(fire, truth, t_s) {
                 let splats = plume.splats();
-                clouds.push(Burning { fire, class: BurningClass::Smoke, splats });
+                clouds.push(Burning {
+                    fire,
+                    class: BurningClass::Smoke,
+                    splats,
+                });
             }
         }
         clouds
@@ -211,10 +221,20 @@ impl World {
     }
 
     fn flame(&self, fire: usize, t_s: f64) -> Option<Flame> {
-        let truth = self.fires.get(fire).filter(|truth| truth.class == BurningClass::Fire)?;
+        let truth = self
+            .fires
+            .get(fire)
+            .filter(|truth| truth.class == BurningClass::Fire)?;
         let (width_m, height_m) = truth.size_at(t_s)?;
         let (seed, base_m, wind_m_s) = (self.fire_seed(fire), truth.base_m, self.wind_m_s);
-        Some(Flame { seed, base_m, width_m, height_m, wind_m_s, t_s })
+        Some(Flame {
+            seed,
+            base_m,
+            width_m,
+            height_m,
+            wind_m_s,
+            t_s,
+        })
     }
 
     fn plume(&self, fire: usize, truth: &FireTruth, t_s: f64) -> Option<Plume> {
@@ -223,7 +243,11 @@ impl World {
         if from_flame && !truth.smokes {
             return None;
         }
-        let rises_m = if from_flame { 4.0 * height_m + 3.0 } else { height_m };
+        let rises_m = if from_flame {
+            4.0 * height_m + 3.0
+        } else {
+            height_m
+        };
         let above_m = if from_flame { 0.75 * height_m } else { 0.0 };
         let seed = self.fire_seed(fire) ^ 0x5EED;
         Some(Plume {
@@ -233,7 +257,11 @@ impl World {
             height_m: rises_m,
             wind_m_s: self.wind_m_s,
             // A fire that burnt when the flight began has its plume already.
-            age_s: if truth.ignites_at_s <= 0.0 { f64::INFINITY } else { t_s - truth.ignites_at_s },
+            age_s: if truth.ignites_at_s <= 0.0 {
+                f64::INFINITY
+            } else {
+                t_s - truth.ignites_at_s
+            },
             t_s,
             colour: self.smoke_colour(seed),
         })
@@ -276,11 +304,18 @@ impl World {
         let spread = config.trees.spread_m;
         let taken: Vec<Vector2<f64>> = places(config);
         for k in 0..config.trees.count {
-            let at = Vector2::new(rng.random_range(-spread..=spread), rng.random_range(-spread..=spread));
+            let at = Vector2::new(
+                rng.random_range(-spread..=spread),
+                rng.random_range(-spread..=spread),
+            );
             let height_m = config.trees.height_m * rng.random_range(0.25..1.5);
-            if taken.iter().all(|place| (place - at).norm() > config.trees.clearance_m) {
+            if taken
+                .iter()
+                .all(|place| (place - at).norm() > config.trees.clearance_m)
+            {
                 let seed = hash(self.seed, k, 0x7E);
-                self.things.add_tree(self.foot(at.x, at.y), height_m, seed, &sun);
+                self.things
+                    .add_tree(self.foot(at.x, at.y), height_m, seed, &sun);
             }
         }
     }
@@ -293,7 +328,11 @@ impl World {
             if truth.class == BurningClass::Fire && burns_ground {
                 let radius_m = truth.width_m * (0.4 + 0.8 * unit(self.seed, fire as u32, 0x5C));
                 let centre_m = truth.base_m.xy();
-                self.things.marks.push(Mark { kind: MarkKind::Scorch, centre_m, radius_m });
+                self.things.marks.push(Mark {
+                    kind: MarkKind::Scorch,
+                    centre_m,
+                    radius_m,
+                });
             }
         }
     }
@@ -303,7 +342,11 @@ fn places(config: &WorldConfig) -> Vec<Vector2<f64>> {
     let fires = config.fires.iter().map(|f| (f.east_m, f.north_m));
     let smokes = config.smokes.iter().map(|s| (s.east_m, s.north_m));
     let lookalikes = config.lookalikes.iter().map(|l| (l.east_m, l.north_m));
-    fires.chain(smokes).chain(lookalikes).map(|(east, north)| Vector2::new(east, north)).collect()
+    fires
+        .chain(smokes)
+        .chain(lookalikes)
+        .map(|(east, north)| Vector2::new(east, north))
+        .collect()
 }
 
 fn truths(config: &WorldConfig, terrain: &Terrain) -> Vec<FireTruth> {
@@ -336,10 +379,20 @@ fn check(config: &WorldConfig) -> Result<(), WorldError> {
         return Err(WorldError::BareGround);
     }
     range("terrain_up_m", config.terrain_up_m, -1000.0, 9000.0)?;
-    if let TerrainConfig::Hills { amplitude_m, wavelength_m, .. } = config.terrain {
+    if let TerrainConfig::Hills {
+        amplitude_m,
+        wavelength_m,
+        ..
+    } = config.terrain
+    {
         range("terrain.amplitude_m", amplitude_m, 0.0, 300.0)?;
         // Steeper ground would hide itself from nearly every pose.
-        range("terrain.wavelength_m", wavelength_m, (8.0 * amplitude_m).max(5.0), 1e5)?;
+        range(
+            "terrain.wavelength_m",
+            wavelength_m,
+            (8.0 * amplitude_m).max(5.0),
+            1e5,
+        )?;
     }
     check_fires(config)?;
     for (k, thing) in config.lookalikes.iter().enumerate() {
@@ -366,7 +419,11 @@ fn check_fires(config: &WorldConfig) -> Result<(), WorldError> {
         range(&key("height_m"), smoke.height_m, 0.5, 500.0)?;
         range(&key("ignites_at_s"), smoke.ignites_at_s, -1e6, 1e6)?;
     }
-    let names = config.fires.iter().map(|f| &f.name).chain(config.smokes.iter().map(|s| &s.name));
+    let names = config
+        .fires
+        .iter()
+        .map(|f| &f.name)
+        .chain(config.smokes.iter().map(|s| &s.name));
     let mut seen = std::collections::BTreeSet::new();
     match names.into_iter().find(|name| !seen.insert(*name)) {
         Some(name) => Err(WorldError::DuplicateName { name: name.clone() }),
@@ -379,8 +436,18 @@ fn check_surroundings(config: &WorldConfig) -> Result<(), WorldError> {
     range("trees.height_m", config.trees.height_m, 0.1, 80.0)?;
     range("trees.spread_m", config.trees.spread_m, 1.0, 5000.0)?;
     range("trees.clearance_m", config.trees.clearance_m, 0.0, 5000.0)?;
-    range("light.sun_azimuth_deg", config.light.sun_azimuth_deg, -360.0, 360.0)?;
-    range("light.sun_elevation_deg", config.light.sun_elevation_deg, 1.0, 90.0)?;
+    range(
+        "light.sun_azimuth_deg",
+        config.light.sun_azimuth_deg,
+        -360.0,
+        360.0,
+    )?;
+    range(
+        "light.sun_elevation_deg",
+        config.light.sun_elevation_deg,
+        1.0,
+        90.0,
+    )?;
     range("light.sun", config.light.sun, 0.0, 3.0)?;
     range("light.ambience", config.light.ambience, 0.0, 3.0)?;
     range("light.visibility_m", config.light.visibility_m, 20.0, 1e6)?;
@@ -397,7 +464,12 @@ fn range(key: &str, value: f64, low: f64, high: f64) -> Result<(), WorldError> {
     if (low..=high).contains(&value) {
         return Ok(());
     }
-    Err(WorldError::OutOfRange { key: key.to_owned(), value, low, high })
+    Err(WorldError::OutOfRange {
+        key: key.to_owned(),
+        value,
+        low,
+        high,
+    })
 }
 
 #[cfg(test)]
@@ -420,7 +492,11 @@ mod tests {
     #[test]
     fn a_fire_stands_on_the_ground_and_grows_after_it_ignites() {
         let config = WorldConfig {
-            terrain: TerrainConfig::Hills { amplitude_m: 6.0, wavelength_m: 150.0, seed: 2 },
+            terrain: TerrainConfig::Hills {
+                amplitude_m: 6.0,
+                wavelength_m: 150.0,
+                seed: 2,
+            },
             terrain_up_m: 12.0,
             fires: vec![fire("a")],
             ..WorldConfig::default()
@@ -436,13 +512,24 @@ mod tests {
 
     #[test]
     fn a_world_that_cannot_be_names_the_key() {
-        let mut config = WorldConfig { fires: vec![fire("a")], ..WorldConfig::default() };
+        let mut config = WorldConfig {
+            fires: vec![fire("a")],
+            ..WorldConfig::default()
+        };
         config.fires[0].width_m = f64::NAN;
         let error = World::new(&config, 1).unwrap_err();
-        assert!(error.to_string().contains("fires[0].width_m is NaN"), "{error}");
+        assert!(
+            error.to_string().contains("fires[0].width_m is NaN"),
+            "{error}"
+        );
         config.fires = vec![fire("a"), fire("a")];
         let error = World::new(&config, 1).unwrap_err();
-        assert_eq!(error, WorldError::DuplicateName { name: "a".to_owned() });
+        assert_eq!(
+            error,
+            WorldError::DuplicateName {
+                name: "a".to_owned()
+            }
+        );
     }
 
     #[test]
@@ -465,6 +552,8 @@ mod tests {
         let config: WorldConfig = toml::from_str(text).unwrap();
         assert_eq!(config.fires.len() + config.lookalikes.len(), 2);
         assert!(toml::from_str::<WorldConfig>("terrane = 1").is_err());
-        assert!(toml::from_str::<WorldConfig>("terrain = { kind = \"flat\", hight_m = 1 }").is_err());
+        assert!(
+            toml::from_str::<WorldConfig>("terrain = { kind = \"flat\", hight_m = 1 }").is_err()
+        );
     }
 }

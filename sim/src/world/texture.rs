@@ -41,20 +41,30 @@ impl Texture {
             let half = last.halved();
             levels.push(half);
         }
-        Self { levels, texels_per_m: side as f32 / tile_m }
+        Self {
+            levels,
+            texels_per_m: side as f32 / tile_m,
+        }
     }
 
     /// Levels for a footprint of one pixel on the ground, metres. The finest detail that a pixel
     /// can still hold is kept; finer would alias and crawl.
     pub(crate) fn lod(&self, footprint_m: f32) -> Lod<'_> {
         let last = self.levels.len() - 1;
-        let wanted = (footprint_m * self.texels_per_m).max(1e-6).log2().clamp(0.0, last as f32);
+        let wanted = (footprint_m * self.texels_per_m)
+            .max(1e-6)
+            .log2()
+            .clamp(0.0, last as f32);
         let (fine, fraction) = (wanted as usize, wanted.fract());
         // The middle of the way is where the blend is seen; beside it one level is enough.
-        let weight = ((fraction - 0.3) / 0.4).clamp(0.0, 1.0);
-        let fine = if weight >= 1.0 { (fine + 1).min(last) } else { fine };
-        let coarse = (weight > 0.0 && weight < 1.0 && fine < last)
-            .then(|| (&self.levels[fine + 1], weight));
+        let weight = ((fraction - 0.4) / 0.2).clamp(0.0, 1.0);
+        let fine = if weight >= 1.0 {
+            (fine + 1).min(last)
+        } else {
+            fine
+        };
+        let coarse =
+            (weight > 0.0 && weight < 1.0 && fine < last).then(|| (&self.levels[fine + 1], weight));
         let halvings = (1 << fine) as f32;
         Lod {
             fine: &self.levels[fine],
@@ -72,7 +82,10 @@ impl Texture {
     /// A place within the tile, metres: what single precision can add to.
     pub(crate) fn origin(&self, (east_m, north_m): (f64, f64)) -> (f32, f32) {
         let tile = f64::from(self.levels[0].mask + 1) / f64::from(self.texels_per_m);
-        (east_m.rem_euclid(tile) as f32, north_m.rem_euclid(tile) as f32)
+        (
+            east_m.rem_euclid(tile) as f32,
+            north_m.rem_euclid(tile) as f32,
+        )
     }
 }
 
@@ -94,7 +107,11 @@ impl Lod<'_> {
 
 impl Level {
     fn new(side: usize, texels: Vec<[u8; 4]>) -> Self {
-        Self { mask: side as i32 - 1, shift: side.trailing_zeros(), texels }
+        Self {
+            mask: side as i32 - 1,
+            shift: side.trailing_zeros(),
+            texels,
+        }
     }
 
     fn halved(&self) -> Self {
@@ -117,7 +134,11 @@ impl Level {
         let (ix, iy) = (floor(x), floor(y));
         let (fx, fy) = (x - ix as f32, y - iy as f32);
         let top = mix(lanes(self.texel(ix, iy)), lanes(self.texel(ix + 1, iy)), fx);
-        let bottom = mix(lanes(self.texel(ix, iy + 1)), lanes(self.texel(ix + 1, iy + 1)), fx);
+        let bottom = mix(
+            lanes(self.texel(ix, iy + 1)),
+            lanes(self.texel(ix + 1, iy + 1)),
+            fx,
+        );
         mix(top, bottom, fy)
     }
 }
@@ -180,14 +201,38 @@ struct Recipe {
     contrast: f32,
 }
 
-const FINE: Recipe =
-    Recipe { side: 512, tile_m: 3.1, cells: 24, octaves: 4, persistence: 0.85, contrast: 0.22 };
-const MIDDLE: Recipe =
-    Recipe { side: 512, tile_m: 23.7, cells: 10, octaves: 6, persistence: 0.8, contrast: 0.24 };
-const LEAVES: Recipe =
-    Recipe { side: 256, tile_m: 3.3, cells: 12, octaves: 4, persistence: 0.9, contrast: 0.42 };
-const BILLOWS: Recipe =
-    Recipe { side: 128, tile_m: 1.0, cells: 3, octaves: 4, persistence: 0.6, contrast: 0.35 };
+const FINE: Recipe = Recipe {
+    side: 512,
+    tile_m: 3.1,
+    cells: 24,
+    octaves: 4,
+    persistence: 0.85,
+    contrast: 0.22,
+};
+const MIDDLE: Recipe = Recipe {
+    side: 512,
+    tile_m: 23.7,
+    cells: 10,
+    octaves: 6,
+    persistence: 0.8,
+    contrast: 0.24,
+};
+const LEAVES: Recipe = Recipe {
+    side: 256,
+    tile_m: 3.3,
+    cells: 12,
+    octaves: 4,
+    persistence: 0.9,
+    contrast: 0.42,
+};
+const BILLOWS: Recipe = Recipe {
+    side: 128,
+    tile_m: 1.0,
+    cells: 3,
+    octaves: 4,
+    persistence: 0.6,
+    contrast: 0.35,
+};
 const COVER_SIDE: usize = 512;
 const COVER_TILE_M: f32 = 191.0;
 
@@ -217,9 +262,18 @@ fn cover(covers: &[GroundCover], seed: u64) -> Texture {
         persistence: 0.55,
         contrast: 1.0,
     };
-    let fields: Vec<Vec<f32>> =
-        (0..covers.len() as u64).map(|k| fractal(patch, seed ^ (k + 1) << 8)).collect();
-    let speckle = fractal(Recipe { cells: 48, octaves: 4, persistence: 0.8, ..patch }, seed ^ 7);
+    let fields: Vec<Vec<f32>> = (0..covers.len() as u64)
+        .map(|k| fractal(patch, seed ^ (k + 1) << 8))
+        .collect();
+    let speckle = fractal(
+        Recipe {
+            cells: 48,
+            octaves: 4,
+            persistence: 0.8,
+            ..patch
+        },
+        seed ^ 7,
+    );
     let texels = (0..COVER_SIDE * COVER_SIDE).map(|i| {
         let weights: Vec<f32> = fields.iter().map(|field| (4.0 * field[i]).exp()).collect();
         let total: f32 = weights.iter().sum();
@@ -260,7 +314,9 @@ fn fractal(recipe: Recipe, seed: u64) -> Vec<f32> {
         .collect();
     let n = field.len() as f32;
     let mean = field.iter().sum::<f32>() / n;
-    let sigma = (field.iter().map(|v| (v - mean).powi(2)).sum::<f32>() / n).sqrt().max(1e-6);
+    let sigma = (field.iter().map(|v| (v - mean).powi(2)).sum::<f32>() / n)
+        .sqrt()
+        .max(1e-6);
     for value in &mut field {
         *value = ((*value - mean) / sigma).clamp(-3.0, 3.0);
     }
@@ -333,7 +389,10 @@ mod tests {
         for k in 0..50 {
             let (x, y) = (0.07 * k as f32, 0.11 * k as f32);
             let (here, there) = (lod.at(x, y), lod.at(x + LEAVES.tile_m, y - LEAVES.tile_m));
-            assert!(here.iter().zip(there).all(|(a, b)| (a - b).abs() < 0.1), "{here:?} {there:?}");
+            assert!(
+                here.iter().zip(there).all(|(a, b)| (a - b).abs() < 0.1),
+                "{here:?} {there:?}"
+            );
         }
     }
 
@@ -351,7 +410,10 @@ mod tests {
             // Centres of the coarse texels, where it holds the mean of 8 by 8 fine ones.
             let centre = |i: i32| (i as f32 * 8.0 + 3.5) * 23.7 / 512.0;
             let (x, y) = (centre(k % 8), centre(3 * k / 8));
-            assert!((mean_around(x, y) - soft.at(x, y)[1]).abs() < 3.0, "texel {k}");
+            assert!(
+                (mean_around(x, y) - soft.at(x, y)[1]).abs() < 3.0,
+                "texel {k}"
+            );
         }
     }
 }

@@ -60,7 +60,9 @@ pub(crate) struct Glint {
 impl Glint {
     /// Facets of the water that send the sun into an eye at `eye_m` at this time.
     pub(crate) fn splats(&self, eye_m: &Vector3<f64>, sun: &Vector3<f64>, t_s: f64) -> Vec<Splat> {
-        (0..40).filter_map(|k| self.sparkle(k, eye_m, sun, t_s)).collect()
+        (0..40)
+            .filter_map(|k| self.sparkle(k, eye_m, sun, t_s))
+            .collect()
     }
 
     fn sparkle(&self, k: u32, eye_m: &Vector3<f64>, sun: &Vector3<f64>, t_s: f64) -> Option<Splat> {
@@ -109,7 +111,13 @@ pub(crate) struct Things {
 
 impl Things {
     /// A crown of leaf balls on a trunk, with its shadow.
-    pub(crate) fn add_tree(&mut self, foot: Vector3<f64>, height_m: f64, seed: u64, sun: &Vector3<f64>) {
+    pub(crate) fn add_tree(
+        &mut self,
+        foot: Vector3<f64>,
+        height_m: f64,
+        seed: u64,
+        sun: &Vector3<f64>,
+    ) {
         let bush = height_m < 2.0;
         let crown = (if bush { 0.5 } else { 0.32 }) * height_m;
         let albedo = leaf_albedo(seed);
@@ -145,11 +153,21 @@ impl Things {
 
     fn add_shadow(&mut self, foot: Vector3<f64>, height_m: f64, radius_m: f64, sun: &Vector3<f64>) {
         let throw = -sun.xy() * (height_m / sun.z.max(0.2));
-        self.marks.push(Mark { kind: MarkKind::Shadow, centre_m: foot.xy() + throw, radius_m });
+        self.marks.push(Mark {
+            kind: MarkKind::Shadow,
+            centre_m: foot.xy() + throw,
+            radius_m,
+        });
     }
 
     /// A house with a saturated red-orange roof.
-    pub(crate) fn add_house(&mut self, foot: Vector3<f64>, size_m: f64, seed: u64, sun: &Vector3<f64>) {
+    pub(crate) fn add_house(
+        &mut self,
+        foot: Vector3<f64>,
+        size_m: f64,
+        seed: u64,
+        sun: &Vector3<f64>,
+    ) {
         let (along, across) = turned(seed, size_m, 0.7 * size_m);
         let (walls, rise) = (0.35 * size_m, 0.22 * size_m);
         let hue = 0.08 * unit(seed, 0, 31) as f32;
@@ -158,22 +176,58 @@ impl Things {
         let eaves = foot - (along + across) * 0.54 + Vector3::z() * walls;
         let ridge = across * 0.54 + Vector3::z() * rise;
         let rows = (8.0 * size_m as f32 / 3.0).max(4.0);
-        self.quads.push(Quad { corner_m: eaves, along_m: along * 1.08, across_m: ridge, albedo: roof, rows });
+        self.quads.push(Quad {
+            corner_m: eaves,
+            along_m: along * 1.08,
+            across_m: ridge,
+            albedo: roof,
+            rows,
+        });
         let far = eaves + across * 1.08;
         let back = ridge - across * 1.08;
-        self.quads.push(Quad { corner_m: far, along_m: along * 1.08, across_m: back, albedo: roof, rows });
+        self.quads.push(Quad {
+            corner_m: far,
+            along_m: along * 1.08,
+            across_m: back,
+            albedo: roof,
+            rows,
+        });
         self.add_shadow(foot, walls, 0.7 * size_m, sun);
     }
 
     /// A car in signal orange.
-    pub(crate) fn add_vehicle(&mut self, foot: Vector3<f64>, size_m: f64, seed: u64, sun: &Vector3<f64>) {
+    pub(crate) fn add_vehicle(
+        &mut self,
+        foot: Vector3<f64>,
+        size_m: f64,
+        seed: u64,
+        sun: &Vector3<f64>,
+    ) {
         let (along, across) = turned(seed, size_m, 0.42 * size_m);
         let paint = [0.80, 0.20 + 0.1 * unit(seed, 0, 32) as f32, 0.025];
         let (body, cabin) = (0.19 * size_m, 0.13 * size_m);
-        self.add_box(foot + Vector3::z() * (0.05 * size_m), along, across, body, paint);
+        self.add_box(
+            foot + Vector3::z() * (0.05 * size_m),
+            along,
+            across,
+            body,
+            paint,
+        );
         let roof = foot + Vector3::z() * (0.05 * size_m + body);
-        self.add_box(roof, along * 0.5, across * 0.85, 0.8 * cabin, [0.03, 0.035, 0.04]);
-        self.add_box(roof + Vector3::z() * (0.8 * cabin), along * 0.46, across * 0.8, 0.2 * cabin, paint);
+        self.add_box(
+            roof,
+            along * 0.5,
+            across * 0.85,
+            0.8 * cabin,
+            [0.03, 0.035, 0.04],
+        );
+        self.add_box(
+            roof + Vector3::z() * (0.8 * cabin),
+            along * 0.46,
+            across * 0.8,
+            0.2 * cabin,
+            paint,
+        );
         self.add_shadow(foot, 0.5 * body, 0.45 * size_m, sun);
     }
 
@@ -224,14 +278,25 @@ impl Things {
     /// A puddle that glitters.
     pub(crate) fn add_puddle(&mut self, foot: Vector3<f64>, size_m: f64, seed: u64) {
         let radius_m = 0.5 * size_m;
-        self.marks.push(Mark { kind: MarkKind::Puddle, centre_m: foot.xy(), radius_m });
-        self.glints.push(Glint { seed, centre_m: foot, radius_m });
+        self.marks.push(Mark {
+            kind: MarkKind::Puddle,
+            centre_m: foot.xy(),
+            radius_m,
+        });
+        self.glints.push(Glint {
+            seed,
+            centre_m: foot,
+            radius_m,
+        });
     }
 }
 
 fn turned(seed: u64, along_m: f64, across_m: f64) -> (Vector3<f64>, Vector3<f64>) {
     let (sin, cos) = (TAU * unit(seed, 0, 30)).sin_cos();
-    (Vector3::new(cos, sin, 0.0) * along_m, Vector3::new(-sin, cos, 0.0) * across_m)
+    (
+        Vector3::new(cos, sin, 0.0) * along_m,
+        Vector3::new(-sin, cos, 0.0) * across_m,
+    )
 }
 
 /// Mostly green; one in six has turned orange or brown, which is what a detector must bear.
