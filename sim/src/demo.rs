@@ -8,7 +8,7 @@ use crate::autopilot::ErrorsConfig;
 use crate::cameras::Cameras;
 use crate::earth::TangentPlane;
 use crate::flight::Flight;
-use crate::live::{Control, Edges, Flown, LiveError, LiveFlight};
+use crate::live::{Control, Edges, HeadStart, LiveError, LiveFlight};
 use crate::mission::Mission;
 use crate::score::{self, AlarmsError, ErrorBound, Figure, Score};
 use crate::world::World;
@@ -92,6 +92,21 @@ pub struct Demo<'a> {
     pub stop: &'a AtomicBool,
 }
 
+/// How far a demo is.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Progress {
+    /// Pictures are rendered before take-off.
+    Rendering {
+        /// Pairs so far.
+        pairs: u32,
+    },
+    /// In the air.
+    Flying {
+        /// Seconds of flight so far.
+        flown_s: f64,
+    },
+}
+
 /// What a demo showed.
 #[derive(Debug, Serialize)]
 pub struct Report {
@@ -150,17 +165,43 @@ const HTTP_LIMIT: Duration = Duration::from_secs(5);
 
 impl Demo<'_> {
     /// Runs it. The ground station goes on in the returned [`Ground`] until that is dropped;
-    /// `on_progress` hears the seconds of flight.
+    /// `on_progress` hears how far it is.
     ///
     /// # Errors
     /// [`DemoError`] when a program fails, or the ground tells something unreadable.
-    pub fn run(&self, on_progress: impl Fn(f64) + Sync) -> Result<(Report, Ground), DemoError> {
+    pub fn run(
+        &self,
+        on_progress: impl Fn(Progress) + Sync,
+    ) -> Result<(Report, Ground), DemoError> {
         let began = Instant::now();
+        let edges = free_edges()?;
+        let live = self.live_flight(edges.clone());
+        let control = Control::default();
+        let head_start = self.prepare(&live, &control, &on_progress)?;
         let mut ground = Ground::start(&self.folder)?;
         ground.await_answer(self.stop)?;
-        let edges = free_edges()?;
         let mut service = self.start_service(&edges, &ground.url)?;
-        let (flown, mut watch) = self.fly(edges, &mut ground, &mut service, on_progress)?;
+        let mut watch = Watch::new(&ground.url);
+        let flown = std::thread::scope(|scope| {
+            let pilot = scope.spawn(|| live.fly(head_start, &control));
+            let attended = self.attend(
+                || pilot.is_finished(),
+                &mut ground,
+                &mut service,
+                |at_ground| {
+                    at_ground.look();
+                    on_progress(Progress::Flying {
+                        flown_s: control.flown_s(),
+                    });
+                },
+                &mut watch,
+            );
+            if attended.is_err() {
+                control.stop();
+            }
+            let flown = pilot.join().map_err(|_| DemoError::Stopped)?;
+            attended.and(flown.map_err(DemoError::from))
+        })?;
         watch.settle(self.stop)?;
         service.end();
         let plane = TangentPlane::at(self.mission.datum);
@@ -200,44 +241,55 @@ impl Demo<'_> {
         Program::start("emberfix run", command, self.folder.join("run.log"))
     }
 
-    /// Flies on one thread; watches the ground and the children on this one.
-    fn fly(
-        &self,
-        edges: Edges,
-        ground: &mut Ground,
-        service: &mut Program,
-        on_progress: impl Fn(f64),
-    ) -> Result<(Flown, Watch), DemoError> {
-        let live = LiveFlight {
+    fn live_flight(&self, edges: Edges) -> LiveFlight<'_> {
+        LiveFlight {
             mission: self.mission,
             world: Arc::clone(&self.world),
             flight: Arc::clone(&self.flight),
             errors: &self.errors,
             edges,
             service_limit: SERVICE_LIMIT,
-        };
-        let control = Control::default();
-        let mut watch = Watch::new(&ground.url);
-        let flown = std::thread::scope(|scope| {
-            let pilot = scope.spawn(|| live.fly(&control));
-            let mut trouble = None;
-            while !pilot.is_finished() {
+        }
+    }
+
+    /// The pictures, before any other program runs.
+    fn prepare(
+        &self,
+        live: &LiveFlight<'_>,
+        control: &Control,
+        on_progress: &(impl Fn(Progress) + Sync),
+    ) -> Result<HeadStart, DemoError> {
+        std::thread::scope(|scope| {
+            let renderer = scope.spawn(|| live.prepare(control));
+            while !renderer.is_finished() {
                 std::thread::sleep(POLL);
-                on_progress(control.flown_s());
-                watch.look();
-                trouble = self.trouble(ground, service).err();
-                if trouble.is_some() {
+                on_progress(Progress::Rendering {
+                    pairs: control.prepared(),
+                });
+                if self.stop.load(Ordering::Relaxed) {
                     control.stop();
-                    break;
+                    return Err(DemoError::Stopped);
                 }
             }
-            match (trouble, pilot.join()) {
-                (Some(trouble), _) => Err(trouble),
-                (None, Ok(flown)) => Ok(flown?),
-                (None, Err(_)) => Err(DemoError::Stopped),
-            }
-        })?;
-        Ok((flown, watch))
+            renderer.join().map_err(|_| DemoError::Stopped)
+        })
+    }
+
+    /// Looks at the ground and after the children until the flight is over.
+    fn attend(
+        &self,
+        is_over: impl Fn() -> bool,
+        ground: &mut Ground,
+        service: &mut Program,
+        look: impl Fn(&mut Watch),
+        watch: &mut Watch,
+    ) -> Result<(), DemoError> {
+        while !is_over() {
+            std::thread::sleep(POLL);
+            look(watch);
+            self.trouble(ground, service)?;
+        }
+        Ok(())
     }
 
     fn trouble(&self, ground: &mut Ground, service: &mut Program) -> Result<(), DemoError> {
@@ -252,16 +304,28 @@ impl Demo<'_> {
 /// Ports that are free now. Between here and their use another program might take one; then the
 /// service says so.
 fn free_edges() -> Result<Edges, DemoError> {
-    let io = |source| DemoError::Io { what: "a free port".to_owned(), source };
-    let mavlink = UdpSocket::bind("127.0.0.1:0").and_then(|s| s.local_addr()).map_err(io)?;
-    let camera = TcpListener::bind("127.0.0.1:0").and_then(|s| s.local_addr()).map_err(io)?;
-    Ok(Edges { mavlink: format!("udpin:{mavlink}"), camera: format!("tcp-listen:{camera}") })
+    let io = |source| DemoError::Io {
+        what: "a free port".to_owned(),
+        source,
+    };
+    let mavlink = UdpSocket::bind("127.0.0.1:0")
+        .and_then(|s| s.local_addr())
+        .map_err(io)?;
+    let camera = TcpListener::bind("127.0.0.1:0")
+        .and_then(|s| s.local_addr())
+        .map_err(io)?;
+    Ok(Edges {
+        mavlink: format!("udpin:{mavlink}"),
+        camera: format!("tcp-listen:{camera}"),
+    })
 }
 
 /// `emberfix`, beside this program.
 fn emberfix() -> Result<Command, DemoError> {
-    let own = std::env::current_exe()
-        .map_err(|source| DemoError::Io { what: "own program".to_owned(), source })?;
+    let own = std::env::current_exe().map_err(|source| DemoError::Io {
+        what: "own program".to_owned(),
+        source,
+    })?;
     Ok(Command::new(own.with_file_name("emberfix")))
 }
 
@@ -287,7 +351,10 @@ impl Ground {
         let mut command = emberfix()?;
         command.arg("ground").arg(&config);
         let program = Program::start("emberfix ground", command, folder.join("ground.log"))?;
-        Ok(Self { program, url: format!("http://{address}") })
+        Ok(Self {
+            program,
+            url: format!("http://{address}"),
+        })
     }
 
     fn await_answer(&mut self, stop: &AtomicBool) -> Result<(), DemoError> {
@@ -303,7 +370,11 @@ impl Ground {
                 return Err(DemoError::Stopped);
             }
             if since.elapsed() > START_LIMIT {
-                return Err(DemoError::NoAnswer { url, waited_s: START_LIMIT.as_secs(), reason });
+                return Err(DemoError::NoAnswer {
+                    url,
+                    waited_s: START_LIMIT.as_secs(),
+                    reason,
+                });
             }
             std::thread::sleep(POLL);
         }
@@ -363,17 +434,28 @@ impl Watch {
 /// Ids of the alarms that are more than suspected.
 fn told_ids(geojson: &str) -> Vec<String> {
     let collection: serde_json::Value = serde_json::from_str(geojson).unwrap_or_default();
-    let features = collection["features"].as_array().cloned().unwrap_or_default();
+    let features = collection["features"]
+        .as_array()
+        .cloned()
+        .unwrap_or_default();
     let told = features.iter().map(|feature| &feature["properties"]);
     let told = told.filter(|properties| properties["state"] != "suspected");
-    told.filter_map(|properties| properties["id"].as_str().map(str::to_owned)).collect()
+    told.filter_map(|properties| properties["id"].as_str().map(str::to_owned))
+        .collect()
 }
 
 fn get(url: &str) -> Result<String, String> {
-    let config = ureq::Agent::config_builder().timeout_global(Some(HTTP_LIMIT)).build();
-    let mut response =
-        ureq::Agent::new_with_config(config).get(url).call().map_err(|error| error.to_string())?;
-    response.body_mut().read_to_string().map_err(|error| error.to_string())
+    let config = ureq::Agent::config_builder()
+        .timeout_global(Some(HTTP_LIMIT))
+        .build();
+    let mut response = ureq::Agent::new_with_config(config)
+        .get(url)
+        .call()
+        .map_err(|error| error.to_string())?;
+    response
+        .body_mut()
+        .read_to_string()
+        .map_err(|error| error.to_string())
 }
 
 fn utc_now() -> ServiceTime {
@@ -390,12 +472,17 @@ struct Program {
 
 impl Program {
     fn start(name: &'static str, mut command: Command, log: PathBuf) -> Result<Self, DemoError> {
-        let io = |source| DemoError::Io { what: log.display().to_string(), source };
+        let io = |source| DemoError::Io {
+            what: log.display().to_string(),
+            source,
+        };
         let words = File::create(&log).map_err(io)?;
         let also = words.try_clone().map_err(io)?;
         command.stdin(Stdio::null()).stdout(words).stderr(also);
         let program = command.get_program().into();
-        let child = command.spawn().map_err(|source| DemoError::Start { program, source })?;
+        let child = command
+            .spawn()
+            .map_err(|source| DemoError::Start { program, source })?;
         Ok(Self { name, child, log })
     }
 
@@ -452,8 +539,16 @@ impl Report {
         let mut table = comfy_table::Table::new();
         table.load_style(comfy_table::presets::UTF8_HORIZONTAL_ONLY);
         table.set_header([
-            "truth", "class", "alarm", "east m", "north m", "up m", "CE90 m", "in ellipse",
-            "sightings", "first sight to alarm s",
+            "truth",
+            "class",
+            "alarm",
+            "east m",
+            "north m",
+            "up m",
+            "CE90 m",
+            "in ellipse",
+            "sightings",
+            "first sight to alarm s",
         ]);
         for row in &self.score.rows {
             table.add_row(cells(row));
@@ -477,10 +572,17 @@ impl Report {
 }
 
 fn figure_line(figure: &Figure) -> String {
-    let value = figure.value.map_or("none".to_owned(), |value| format!("{value:.2}"));
-    let bound = figure.bound.map_or(String::new(), |bound| format!(", bound {bound}"));
+    let value = figure
+        .value
+        .map_or("none".to_owned(), |value| format!("{value:.2}"));
+    let bound = figure
+        .bound
+        .map_or(String::new(), |bound| format!(", bound {bound}"));
     let verdict = if figure.holds { "" } else { "  DOES NOT HOLD" };
-    format!("\n{:32} {value} {}{bound} (n = {}){verdict}", figure.name, figure.unit, figure.n)
+    format!(
+        "\n{:32} {value} {}{bound} (n = {}){verdict}",
+        figure.name, figure.unit, figure.n
+    )
 }
 
 fn cells(row: &score::Row) -> Vec<String> {
@@ -496,7 +598,9 @@ fn cells(row: &score::Row) -> Vec<String> {
             format!("{:.2}", found.ce90_m),
             if found.inside_ellipse { "yes" } else { "no" }.to_owned(),
             found.sightings.to_string(),
-            found.first_sight_to_alarm_s.map_or("-".to_owned(), |s| format!("{s:.1}")),
+            found
+                .first_sight_to_alarm_s
+                .map_or("-".to_owned(), |s| format!("{s:.1}")),
         ]),
     }
     cells

@@ -3,9 +3,11 @@
 //! **In:** a [`Mission`] and the service's URLs. **Out:** what was sent and heard. The flight begins
 //! [`LEAD_IN_S`] after the service has opened its camera socket; until then only the autopilot talks.
 //!
-//! **Queues.** The renderer works ahead of time by at most [`RENDER_AHEAD`] pairs, then waits. A pair
-//! that is not ready [`LATE_LIMIT_S`] after its time, or that nobody listens to, is dropped and
-//! counted: a late picture would look fresh.
+//! **Queues.** The first [`HEAD_START`] pairs are rendered before take-off ([`LiveFlight::prepare`]), so
+//! that a short flight leaves the processor to the service, as a real camera would; then the renderer
+//! works ahead by at most [`RENDER_AHEAD`] pairs and waits. A pair that would not be ready
+//! [`LATE_LIMIT_S`] after its time is not rendered, one that is late or that nobody listens to is
+//! dropped; both are counted: a late picture would look fresh.
 
 use crate::autopilot::{Autopilot, AutopilotSetup, ErrorsConfig, Heard};
 use crate::cameras::{Cameras, TakenPair};
@@ -16,12 +18,14 @@ use crate::world::World;
 use emberfix_frames::{ServiceTime, seconds};
 use emberfix_mav::FrameReader;
 use mcap::write::NoSeek;
+use rayon::prelude::*;
 use std::io::{BufWriter, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream, ToSocketAddrs, UdpSocket};
+use std::ops::Range;
 use std::os::unix::net::{UnixListener, UnixStream};
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
-use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
+use std::sync::mpsc::{SyncSender, sync_channel};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant, SystemTime};
 
@@ -29,7 +33,9 @@ use std::time::{Duration, Instant, SystemTime};
 pub const LEAD_IN_S: f64 = 4.0;
 /// Autopilot alone after the last pair, seconds.
 const LEAD_OUT_S: f64 = 1.0;
-/// Pairs that wait for their time at most (about 0.5 MB each).
+/// Pairs that are rendered before take-off at most (0.8 MB each).
+pub const HEAD_START: u32 = 240;
+/// Pairs that wait for their time at most, beyond the head start.
 pub const RENDER_AHEAD: usize = 32;
 /// Latest that a pair is still sent, seconds after its time.
 pub const LATE_LIMIT_S: f64 = 0.5;
@@ -125,6 +131,7 @@ impl FlightClock {
 pub struct Control {
     stop: AtomicBool,
     flown_ms: AtomicU32,
+    prepared: AtomicU32,
 }
 
 impl Control {
@@ -143,6 +150,12 @@ impl Control {
     #[must_use]
     pub fn flown_s(&self) -> f64 {
         f64::from(self.flown_ms.load(Ordering::Relaxed)) * 1e-3
+    }
+
+    /// Pairs rendered before take-off so far.
+    #[must_use]
+    pub fn prepared(&self) -> u32 {
+        self.prepared.load(Ordering::Relaxed)
     }
 
     fn set_flown(&self, flown_s: f64) {
@@ -167,22 +180,41 @@ pub struct LiveFlight<'a> {
     pub service_limit: Duration,
 }
 
+/// Pairs that wait for take-off.
+#[derive(Debug, Default)]
+pub struct HeadStart(Vec<TakenPair>);
+
 impl LiveFlight<'_> {
+    /// Renders the head start on all processors, or as much as there is before `control` stops it.
+    #[must_use]
+    pub fn prepare(&self, control: &Control) -> HeadStart {
+        let cameras = self.cameras();
+        let last = cameras.count().min(HEAD_START);
+        let take = |index| {
+            let pair = (!control.is_stopped()).then(|| cameras.take(index));
+            control.prepared.fetch_add(1, Ordering::Relaxed);
+            pair
+        };
+        HeadStart((0..last).into_par_iter().map(take).while_some().collect())
+    }
+
+    fn cameras(&self) -> Cameras {
+        let (world, flight) = (Arc::clone(&self.world), Arc::clone(&self.flight));
+        Cameras::new(self.mission, world, flight, self.errors)
+    }
+
     /// Flies, in real time, to the end or until `control` stops it.
     ///
     /// # Errors
-    /// [`LiveError`] when a URL can't be used or a port can't be opened.
-    pub fn fly(&self, control: &Control) -> Result<Flown, LiveError> {
+    /// [`LiveError`] when a URL can't be used, a port can't be opened, or the service never opens
+    /// its camera socket.
+    pub fn fly(&self, head_start: HeadStart, control: &Control) -> Result<Flown, LiveError> {
         let port = MavlinkPort::open(&self.edges.mavlink)?;
         let mut doorway = CameraDoorway::open(&self.edges.camera)?;
         let socket = self.await_service(&mut doorway, control)?;
         let clock = FlightClock::starting_in(LEAD_IN_S);
-        let cameras = Cameras::new(
-            self.mission,
-            Arc::clone(&self.world),
-            Arc::clone(&self.flight),
-            self.errors,
-        );
+        let cameras = self.cameras();
+        let first = head_start.0.len() as u32;
         let pictures_over = AtomicBool::new(false);
         let heard = Mutex::new(Heard::default());
         let (sender, receiver) = sync_channel(RENDER_AHEAD);
@@ -195,8 +227,14 @@ impl LiveFlight<'_> {
                     *heard = said;
                 }
             });
-            scope.spawn(|| render_ahead(&cameras, &clock, control, sender));
-            self.show(socket, &mut doorway, &clock, control, &receiver, &mut flown);
+            scope.spawn(|| render_ahead(first..cameras.count(), &cameras, &clock, control, sender));
+            let pairs = head_start
+                .0
+                .into_iter()
+                .map(Rendered::Pair)
+                .chain(receiver.iter());
+            self.show(socket, &mut doorway, &clock, control, pairs, &mut flown);
+            // The renderer may wait for room: without a receiver it ends.
             drop(receiver);
             pictures_over.store(true, Ordering::Relaxed);
         });
@@ -247,7 +285,7 @@ impl LiveFlight<'_> {
         });
         let end_s = self.flight.duration_s() + LEAD_OUT_S;
         let mut reader = FrameReader::new();
-        while !control.is_stopped() && !(pictures_over() && clock.now_s() > end_s) {
+        while !control.is_stopped() && (!pictures_over() || clock.now_s() <= end_s) {
             port.receive(&mut reader);
             while let Some(frame) = reader.next_frame() {
                 autopilot.receive(clock.now_s(), &frame);
@@ -267,25 +305,24 @@ impl LiveFlight<'_> {
         doorway: &mut CameraDoorway,
         clock: &FlightClock,
         control: &Control,
-        pairs: &Receiver<Rendered>,
+        pairs: impl Iterator<Item = Rendered>,
         flown: &mut Flown,
     ) {
         let mut listener = socket.and_then(|socket| Listener::greet(socket, self, clock));
-        while !control.is_stopped() {
+        for rendered in pairs {
+            let Rendered::Pair(pair) = rendered else {
+                flown.pairs_late += 1;
+                continue;
+            };
+            wait_until(clock, pair.arrives_s, control);
+            if control.is_stopped() {
+                return;
+            }
             if listener.is_none() {
-                listener = doorway
-                    .connect()
-                    .and_then(|socket| Listener::greet(socket, self, clock));
+                let socket = doorway.connect();
+                listener = socket.and_then(|socket| Listener::greet(socket, self, clock));
             }
-            match pairs.recv_timeout(RETRY) {
-                Ok(Rendered::Late) => flown.pairs_late += 1,
-                Ok(Rendered::Pair(pair)) => {
-                    wait_until(clock, pair.arrives_s, control);
-                    self.deliver(pair, clock, &mut listener, flown);
-                }
-                Err(RecvTimeoutError::Timeout) => {}
-                Err(RecvTimeoutError::Disconnected) => return,
-            }
+            self.deliver(pair, clock, &mut listener, flown);
         }
     }
 
@@ -314,25 +351,30 @@ impl LiveFlight<'_> {
 
 enum Rendered {
     Pair(TakenPair),
-    /// Its time had passed before rendering began.
+    /// It would not have been ready in time.
     Late,
 }
 
 fn render_ahead(
+    indices: Range<u32>,
     cameras: &Cameras,
     clock: &FlightClock,
     control: &Control,
     pairs: SyncSender<Rendered>,
 ) {
-    for index in 0..cameras.count() {
+    let mut rendering_s = 0.0;
+    for index in indices {
         if control.is_stopped() {
             return;
         }
-        let late = clock.now_s() > cameras.arrives_s(index) + LATE_LIMIT_S;
+        let begun_s = clock.now_s();
+        let late = begun_s + rendering_s > cameras.arrives_s(index) + LATE_LIMIT_S;
         let rendered = if late {
             Rendered::Late
         } else {
-            Rendered::Pair(cameras.take(index))
+            let pair = cameras.take(index);
+            rendering_s = clock.now_s() - begun_s;
+            Rendered::Pair(pair)
         };
         if pairs.send(rendered).is_err() {
             return;

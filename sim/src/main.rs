@@ -3,7 +3,7 @@
 use anyhow::Context;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use emberfix_sim::autopilot::ErrorsConfig;
-use emberfix_sim::demo::{Demo, DemoError, Report};
+use emberfix_sim::demo::{Demo, DemoError, Progress, Report};
 use emberfix_sim::live::{Control, Edges, LiveFlight};
 use emberfix_sim::mission::Mission;
 use emberfix_sim::record::record;
@@ -18,7 +18,11 @@ use std::time::Duration;
 
 /// A seeded world that plays autopilot and cameras for emberfix.
 #[derive(Debug, Parser)]
-#[command(version, args_conflicts_with_subcommands = true, arg_required_else_help = true)]
+#[command(
+    version,
+    args_conflicts_with_subcommands = true,
+    arg_required_else_help = true
+)]
 struct Cli {
     #[command(subcommand)]
     command: Option<SubCommand>,
@@ -95,7 +99,11 @@ enum Errors {
 impl Errors {
     fn of(self, mission: &Mission) -> ErrorsConfig {
         let errors = &mission.sim.errors;
-        if self == Self::Off || errors.off { errors.sensors_off() } else { errors.clone() }
+        if self == Self::Off || errors.off {
+            errors.sensors_off()
+        } else {
+            errors.clone()
+        }
     }
 }
 
@@ -121,8 +129,13 @@ fn main() -> ExitCode {
     };
     mission.sim.seed = seed.unwrap_or(mission.sim.seed);
     let done = match cli {
-        Cli { command: Some(SubCommand::Demo(args)), .. } => demo(&args, &mission),
-        Cli { fly: Some(args), .. } => fly(&args, &mission).map(|()| true),
+        Cli {
+            command: Some(SubCommand::Demo(args)),
+            ..
+        } => demo(&args, &mission),
+        Cli {
+            fly: Some(args), ..
+        } => fly(&args, &mission).map(|()| true),
         Cli { .. } => return ExitCode::from(REFUSED),
     };
     match done {
@@ -159,13 +172,19 @@ fn write_dataset(folder: &Path, frames: usize, mission: &Mission) -> anyhow::Res
 
 fn fly_offline(file: &Path, mission: &Mission, errors: &ErrorsConfig) -> anyhow::Result<()> {
     let (world, flight) = setup(mission)?;
-    let destination = std::fs::File::create(file)
-        .with_context(|| format!("recording {}", file.display()))?;
+    let destination =
+        std::fs::File::create(file).with_context(|| format!("recording {}", file.display()))?;
     let pairs = (flight.duration_s() * mission.sim.camera.rate_hz).floor() as u64;
     let bar = bar(pairs, "{pos}/{len} pairs, {eta} left");
     let on_pair = |done: u32| bar.set_position(done.into());
-    let recorded =
-        record(mission, &world, &flight, errors, BufWriter::new(destination), on_pair)?;
+    let recorded = record(
+        mission,
+        &world,
+        &flight,
+        errors,
+        BufWriter::new(destination),
+        on_pair,
+    )?;
     bar.finish_and_clear();
     eprintln!(
         "{}: {} pairs, {} MAVLink frames, {:.0} s of flight",
@@ -180,16 +199,32 @@ fn fly_offline(file: &Path, mission: &Mission, errors: &ErrorsConfig) -> anyhow:
 fn fly_live(args: &FlyArgs, mission: &Mission, errors: &ErrorsConfig) -> anyhow::Result<()> {
     let (world, flight) = setup(mission)?;
     let edges = Edges {
-        mavlink: args.mavlink.clone().unwrap_or_else(|| mission.mavlink_url.clone()),
-        camera: args.camera.clone().unwrap_or_else(|| mission.camera_url.clone()),
+        mavlink: args
+            .mavlink
+            .clone()
+            .unwrap_or_else(|| mission.mavlink_url.clone()),
+        camera: args
+            .camera
+            .clone()
+            .unwrap_or_else(|| mission.camera_url.clone()),
     };
-    eprintln!("{}: MAVLink {}, pairs {}", mission.name, edges.mavlink, edges.camera);
+    eprintln!(
+        "{}: MAVLink {}, pairs {}",
+        mission.name, edges.mavlink, edges.camera
+    );
     let service_limit = SERVICE_LIMIT;
-    let live = LiveFlight { mission, world, flight: Arc::clone(&flight), errors, edges, service_limit };
+    let live = LiveFlight {
+        mission,
+        world,
+        flight: Arc::clone(&flight),
+        errors,
+        edges,
+        service_limit,
+    };
     let control = Control::default();
     let bar = flight_bar(flight.duration_s());
     let flown = std::thread::scope(|scope| {
-        let pilot = scope.spawn(|| live.fly(&control));
+        let pilot = scope.spawn(|| live.fly(live.prepare(&control), &control));
         while !pilot.is_finished() {
             std::thread::sleep(Duration::from_millis(200));
             bar.set_position(control.flown_s() as u64);
@@ -223,14 +258,23 @@ fn demo(args: &DemoArgs, mission: &Mission) -> anyhow::Result<bool> {
         flight: Arc::clone(&flight),
         stop: &stop,
     };
-    let bar = flight_bar(flight.duration_s());
-    let ran = demo.run(|flown_s| bar.set_position(flown_s as u64));
-    bar.finish_and_clear();
+    let (pictures, flying) = (ProgressBar::new_spinner(), flight_bar(flight.duration_s()));
+    let ran = demo.run(|progress| match progress {
+        Progress::Rendering { pairs } => pictures.set_message(format!("{pairs} pairs rendered")),
+        Progress::Flying { flown_s } => {
+            pictures.finish_and_clear();
+            flying.set_position(flown_s as u64);
+        }
+    });
+    flying.finish_and_clear();
     let (report, ground) = match ran {
         Err(DemoError::Stopped) => return Ok(false),
         ran => ran?,
     };
-    std::fs::write(folder.path.join("report.json"), serde_json::to_vec_pretty(&report)?)?;
+    std::fs::write(
+        folder.path.join("report.json"),
+        serde_json::to_vec_pretty(&report)?,
+    )?;
     show(args, &report, &folder)?;
     if !args.headless {
         keep_page_up(&report, &stop);
@@ -277,9 +321,11 @@ impl Folder {
     fn new(args: &DemoArgs) -> anyhow::Result<Self> {
         let own = || std::env::temp_dir().join(format!("emberfix-demo-{}", std::process::id()));
         let path = args.out.clone().unwrap_or_else(own);
-        std::fs::create_dir_all(&path)
-            .with_context(|| format!("folder {}", path.display()))?;
-        Ok(Self { path: path.canonicalize()?, stays: args.keep || args.out.is_some() })
+        std::fs::create_dir_all(&path).with_context(|| format!("folder {}", path.display()))?;
+        Ok(Self {
+            path: path.canonicalize()?,
+            stays: args.keep || args.out.is_some(),
+        })
     }
 }
 
@@ -296,7 +342,9 @@ impl Drop for Folder {
 fn stop_on_signal() -> anyhow::Result<Arc<AtomicBool>> {
     let stop = Arc::new(AtomicBool::new(false));
     let flag = Arc::clone(&stop);
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()?;
     let mut terminate = {
         let _inside = runtime.enter();
         tokio::signal::unix::signal(tokio::signal::unix::SignalKind::terminate())?
@@ -319,7 +367,7 @@ fn flight_bar(duration_s: f64) -> ProgressBar {
 
 fn bar(length: u64, words: &str) -> ProgressBar {
     let template = format!("{{bar:40}} {words}");
-    let style = ProgressStyle::with_template(&template)
-        .unwrap_or_else(|_| ProgressStyle::default_bar());
+    let style =
+        ProgressStyle::with_template(&template).unwrap_or_else(|_| ProgressStyle::default_bar());
     ProgressBar::new(length).with_style(style)
 }

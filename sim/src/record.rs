@@ -53,7 +53,10 @@ pub fn record<W: Write + Seek>(
     let mut tape = Tape::new(mission, flight, errors, destination)?;
     for first in (0..cameras.count()).step_by(BATCH as usize) {
         let batch = first..(first + BATCH).min(cameras.count());
-        let pairs: Vec<_> = batch.into_par_iter().map(|index| cameras.take(index)).collect();
+        let pairs: Vec<_> = batch
+            .into_par_iter()
+            .map(|index| cameras.take(index))
+            .collect();
         for pair in pairs {
             tape.add_pair(mission, pair)?;
             on_pair(tape.recorded.pairs);

@@ -89,7 +89,9 @@ impl Metadata<'_> {
             .json::<[f32; 3]>("mean", expected)?
             .unwrap_or(usual.mean);
         let std = self.json::<[f32; 3]>("std", expected)?.unwrap_or(usual.std);
-        if mean.iter().any(|value| !value.is_finite()) || std.iter().any(|value| !(*value > 0.0)) {
+        if mean.iter().any(|value| !value.is_finite())
+            || std.iter().any(|value| value.is_nan() || *value <= 0.0)
+        {
             return Err(self.malformed("mean, std", &format!("{mean:?}, {std:?}"), expected));
         }
         let colour = match self.entries.get("color").map(String::as_str) {

@@ -47,12 +47,7 @@ impl Gray {
 
 /// Normalised correlation of the left pixels with the right ones `disparity` to their left; `None`
 /// where one of them is flat or too few are in the image.
-fn correlation(
-    left: &Gray,
-    right: &Gray,
-    pixels: &[(i32, i32)],
-    disparity: i32,
-) -> Option<f64> {
+fn correlation(left: &Gray, right: &Gray, pixels: &[(i32, i32)], disparity: i32) -> Option<f64> {
     let (mut n, mut l, mut r, mut ll, mut rr, mut lr) = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0);
     for &(column, row) in pixels {
         let other = column - disparity;
@@ -84,7 +79,10 @@ pub(super) fn peak_near(
     (middle - 2..=middle + 2)
         .filter_map(|disparity_px| {
             let correlation = correlation(left, right, pixels, disparity_px)?;
-            Some(Peak { disparity_px, correlation })
+            Some(Peak {
+                disparity_px,
+                correlation,
+            })
         })
         .max_by(|a, b| a.correlation.total_cmp(&b.correlation))
 }
@@ -111,7 +109,8 @@ pub(super) fn refine(
         if (state.x - start_px).abs() > 1.5 {
             return None;
         }
-        if step.x.abs() < 1e-4 && scale.is_finite() {
+        // Gain and offset too: the residuals are those of the state before this step.
+        if step.x.abs() < 1e-4 && step.y.abs() < 1e-3 && step.z.abs() < 0.1 {
             break;
         }
     }
@@ -175,11 +174,16 @@ mod tests {
             let (u, v) = (f64::from(k % 60) + shift, f64::from(k / 60));
             (120.0 + 60.0 * (0.7 * u + 0.3 * v).sin() + 30.0 * (0.31 * u - v).cos()) as f32
         };
-        Gray { width: 60, values: (0..60 * 20).map(value).collect() }
+        Gray {
+            width: 60,
+            values: (0..60 * 20).map(value).collect(),
+        }
     }
 
     fn pixels() -> Vec<(i32, i32)> {
-        (0..20).flat_map(|row| (20..50).map(move |column| (column, row))).collect()
+        (0..20)
+            .flat_map(|row| (20..50).map(move |column| (column, row)))
+            .collect()
     }
 
     #[test]
@@ -194,18 +198,16 @@ mod tests {
             assert!(peak.correlation > 0.9 && (f64::from(peak.disparity_px) - truth).abs() < 0.6);
             let (found, sigma) = refine(&wave(0.0), &right, &pixels(), peak.disparity_px).unwrap();
             assert!((found - truth).abs() < 0.01, "{found} {truth}");
-            assert!(sigma < 0.05, "{sigma}");
+            assert!(sigma < 0.02, "{sigma}");
         }
     }
 
     #[test]
     fn a_flat_eye_has_no_peak() {
-        let flat = Gray { width: 60, values: vec![80.0; 60 * 20] };
+        let flat = Gray {
+            width: 60,
+            values: vec![80.0; 60 * 20],
+        };
         assert_eq!(peak_near(&wave(0.0), &flat, &pixels(), 5), None);
-    }
-
-    #[test]
-    fn a_match_that_runs_away_is_none() {
-        assert_eq!(refine(&wave(0.0), &wave(9.0), &pixels(), 5).map(|found| found.0 > 6.5), None);
     }
 }

@@ -165,6 +165,9 @@ struct Reach {
 /// Disparities below infinity's that are tried, so that noise there is not cut off on one side.
 const BELOW_INFINITY_PX: i32 = 4;
 
+/// Pixels that are matched as one, at most: more of them no longer lower the error.
+const MAX_PIXELS: usize = 3000;
+
 impl SgbmRanger {
     /// A ranger for one rig.
     ///
@@ -232,7 +235,12 @@ impl SgbmRanger {
             return Ok(None);
         }
         let (left, right) = (gray(&patch.left_gray)?, gray(&patch.right_gray)?);
-        let pixels: Vec<_> = samples.iter().map(|sample| sample.at).collect();
+        let every = samples.len().div_ceil(MAX_PIXELS);
+        let pixels: Vec<_> = samples
+            .iter()
+            .step_by(every)
+            .map(|sample| sample.at)
+            .collect();
         let whole = pooled.disparity_px.round() as i32;
         // A disparity that the target as a whole does not bear out is a phantom.
         let Some(peak) = peak_near(&left, &right, &pixels, whole)
@@ -240,11 +248,17 @@ impl SgbmRanger {
         else {
             return Ok(None);
         };
-        let found = match config.method {
-            MatchMethod::Sgbm => Some(Found::pooled(&pooled, config.block_px)),
-            MatchMethod::Correlate => refine(&left, &right, &pixels, peak.disparity_px)
-                .map(|(disparity_px, sigma_px)| Found { disparity_px, sigma_px, pooled }),
-        };
+        let found =
+            match config.method {
+                MatchMethod::Sgbm => Some(Found::pooled(&pooled, config.block_px)),
+                MatchMethod::Correlate => refine(&left, &right, &pixels, peak.disparity_px).map(
+                    |(disparity_px, sigma_px)| Found {
+                        disparity_px,
+                        sigma_px,
+                        pooled,
+                    },
+                ),
+            };
         Ok(found.map(|found| Found {
             sigma_px: found.sigma_px.max(config.sigma_floor_px),
             ..found
@@ -350,12 +364,12 @@ fn target_mask(patch: &Patch, config: &SgbmConfig) -> Result<Vec<bool>, RangeErr
         .zip(&gate)
         .map(|(pixel, kept)| *kept && shine(pixel) > floor)
         .collect();
-    let enough = |mask: &[bool]| {
-        mask.iter().filter(|kept| **kept).count() >= config.min_support as usize
-    };
-    Ok([shining, gate].into_iter().find(|mask| enough(mask)).unwrap_or_else(|| {
-        vec![true; (target.width * target.height) as usize]
-    }))
+    let enough =
+        |mask: &[bool]| mask.iter().filter(|kept| **kept).count() >= config.min_support as usize;
+    Ok([shining, gate]
+        .into_iter()
+        .find(|mask| enough(mask))
+        .unwrap_or_else(|| vec![true; (target.width * target.height) as usize]))
 }
 
 /// How much like flame a pixel shines: bright in red, weak in blue.

@@ -110,7 +110,10 @@ impl Scene {
             width: 2.0 * reach_u,
             height: 2.0 * reach_v,
         };
-        Target { class: DetectionClass::Fire, box_px }
+        Target {
+            class: DetectionClass::Fire,
+            box_px,
+        }
     }
 }
 
@@ -313,8 +316,13 @@ fn a_dead_dark_or_flat_right_eye_is_no_match() {
 /// What matches in smoke is the ground behind it.
 #[test]
 fn smoke_is_no_match() {
-    let target = Target { class: DetectionClass::Smoke, ..SCENE.target() };
-    let found = ranger(MatchMethod::Correlate).range(&SCENE.pair(), &target).unwrap();
+    let target = Target {
+        class: DetectionClass::Smoke,
+        ..SCENE.target()
+    };
+    let found = ranger(MatchMethod::Correlate)
+        .range(&SCENE.pair(), &target)
+        .unwrap();
     assert_eq!(found, Ranging::NoMatch);
 }
 

@@ -9,7 +9,7 @@ use crate::pipeline::{Event, Output, Pipeline};
 use crate::pose::Pose;
 use crate::record::{BodyPose, Recorder, UavFix};
 use emberfix_frames::{
-    Covariance, ServiceTime, UnitQuaternion, Wgs84, Wgs84Parts, enu_offset,
+    Covariance, ServiceTime, SignedDuration, UnitQuaternion, Wgs84, Wgs84Parts, enu_offset,
 };
 use emberfix_mav::Received;
 use std::sync::Arc;
@@ -72,8 +72,7 @@ pub fn start(
 
 impl Core {
     fn take_mavlink(&mut self, arrived: ServiceTime, received: Box<Received>) {
-        // The recording's order is the order in which the pipeline took events in.
-        let arrived = arrived.max(self.pipeline.now());
+        let arrived = self.in_order(arrived);
         if let Some(recorder) = &self.recorder {
             recorder.write_mavlink(arrived, &received.frame.bytes);
         }
@@ -81,11 +80,17 @@ impl Core {
         self.hand_on(outputs);
     }
 
+    /// An arrival after every earlier one. A recording is replayed in the order of arrivals, and it
+    /// must be the order in which the pipeline took the events in; equal arrivals would not say.
+    fn in_order(&self, arrived: ServiceTime) -> ServiceTime {
+        arrived.max(self.pipeline.now() + SignedDuration::from_nanos(1))
+    }
+
     fn take_pair(&mut self, slot: &Slot) {
         let Some(mut pair) = slot.take() else {
             return;
         };
-        pair.value.arrived = pair.value.arrived.max(self.pipeline.now());
+        pair.value.arrived = self.in_order(pair.value.arrived);
         if let Some(recorder) = &self.recorder {
             recorder.write_pair(&pair);
         }

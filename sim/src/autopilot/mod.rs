@@ -380,3 +380,6 @@ impl Autopilot {
 
 /// PX4's loops do not run a stream faster than about this.
 const SHORTEST_INTERVAL_S: f64 = 0.004;
+
+#[cfg(test)]
+mod tests;
