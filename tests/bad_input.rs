@@ -10,6 +10,8 @@ mod flight;
 mod hover;
 #[path = "support/pictures.rs"]
 mod pictures;
+#[path = "support/replays.rs"]
+mod replays;
 mod support;
 
 use emberfix::ingest::StereoPair;
@@ -36,9 +38,10 @@ fn assert_refused(said: &Said, names: &[&str]) {
 }
 
 /// `replay` of no matter what, without a model.
-fn replay(scratch: &Scratch) -> Said {
+fn replay_nothing(scratch: &Scratch) -> Said {
     let boxes = scratch.write("boxes.csv", pictures::boxes(1));
-    scratch.replay(
+    replays::replay(
+        scratch,
         &scratch.path("rec.mcap"),
         "out",
         &["--boxes", boxes.to_str().unwrap()],
@@ -89,7 +92,10 @@ fn each_broken_mission_is_refused_by_file_key_value_and_range() {
     let scratch = Scratch::new();
     for (from, to, names) in broken {
         scratch.write("mission.toml", edited(PLAIN_MISSION, from, to));
-        assert_refused(&replay(&scratch), &[&["mission.toml"], names].concat());
+        assert_refused(
+            &replay_nothing(&scratch),
+            &[&["mission.toml"], names].concat(),
+        );
     }
 }
 
@@ -110,11 +116,11 @@ fn each_broken_rig_is_refused_by_file_key_value_and_range() {
     let scratch = Scratch::new();
     for (from, to, names) in broken {
         scratch.write("rig.toml", edited(PLAIN_RIG, from, to));
-        assert_refused(&replay(&scratch), &[&["rig.toml"], names].concat());
+        assert_refused(&replay_nothing(&scratch), &[&["rig.toml"], names].concat());
     }
     std::fs::remove_file(scratch.path("rig.toml")).unwrap();
     assert_refused(
-        &replay(&scratch),
+        &replay_nothing(&scratch),
         &["rig.toml", "No such file", "oakd-75mm.toml"],
     );
 }
@@ -131,7 +137,7 @@ fn with_model(model: &Path, keys: &str) -> Said {
         "mission.toml",
         edited(PLAIN_MISSION, "\"no-model.onnx\"", &path),
     );
-    scratch.replay(&scratch.path("rec.mcap"), "out", &[])
+    replays::replay(&scratch, &scratch.path("rec.mcap"), "out", &[])
 }
 
 #[test]
@@ -195,20 +201,20 @@ fn a_model_of_another_shape_is_refused_with_the_shape_it_should_have() {
 #[test]
 fn a_file_that_is_no_recording_is_refused() {
     let scratch = Scratch::new();
-    assert_refused(&replay(&scratch), &["rec.mcap", "No such file"]);
+    assert_refused(&replay_nothing(&scratch), &["rec.mcap", "No such file"]);
     scratch.write("rec.mcap", [0x5A; 3000]);
     assert_refused(
-        &replay(&scratch),
+        &replay_nothing(&scratch),
         &["rec.mcap", "no MCAP file", "3000 bytes"],
     );
     let no_log = scratch.write("a.tlog", [0x5A; 3000]);
     assert_refused(
-        &scratch.replay(&no_log, "out", &[]),
+        &replays::replay(&scratch, &no_log, "out", &[]),
         &["a.tlog", "no MAVLink frame"],
     );
     let boxes = ["--boxes", "nowhere.jsonl"];
     assert_refused(
-        &scratch.replay(&no_log.with_extension("mcap"), "out", &boxes),
+        &replays::replay(&scratch, &no_log.with_extension("mcap"), "out", &boxes),
         &["nowhere.jsonl"],
     );
 }
@@ -219,11 +225,11 @@ fn a_recording_cut_before_its_first_message_is_refused_and_a_torn_one_is_used_as
     let whole = std::fs::read(hover::record(&scratch, 20, |_| {})).unwrap();
     scratch.write("rec.mcap", &whole[..300]);
     assert_refused(
-        &replay(&scratch),
+        &replay_nothing(&scratch),
         &["rec.mcap", "holds no whole message", "bytes cut off"],
     );
     scratch.write("rec.mcap", &whole[..whole.len() * 6 / 10]);
-    let torn = replay(&scratch);
+    let torn = replay_nothing(&scratch);
     assert!(
         torn.err.contains("torn or damaged"),
         "said loudly: {}",
@@ -292,9 +298,13 @@ fn flown(change: impl Fn(&mut StereoPair)) -> (Value, Vec<Value>) {
     let scratch = Scratch::new();
     let recording = hover::record(&scratch, PAIRS, change);
     let boxes = scratch.write("boxes.csv", pictures::boxes(PAIRS));
-    let summary = scratch
-        .replay(&recording, "out", &["--boxes", boxes.to_str().unwrap()])
-        .json();
+    let summary = replays::replay(
+        &scratch,
+        &recording,
+        "out",
+        &["--boxes", boxes.to_str().unwrap()],
+    )
+    .json();
     let fixes = std::fs::read_to_string(scratch.path("out").join("fixes.jsonl")).unwrap();
     (
         summary,

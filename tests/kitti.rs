@@ -17,6 +17,8 @@
 mod clients;
 #[path = "support/flight.rs"]
 mod flight;
+#[path = "support/replays.rs"]
+mod replays;
 #[path = "support/shared.rs"]
 mod shared;
 mod support;
@@ -379,9 +381,13 @@ fn static_things_keep_one_place_while_the_car_drives_by() {
     let boxes: PathBuf = scratch.path("boxes.jsonl");
     let replay = |out: &str| {
         let boxes = boxes.to_str().unwrap();
-        scratch
-            .replay(&scratch.path("rec.mcap"), out, &["--boxes", boxes])
-            .json()
+        replays::replay(
+            &scratch,
+            &scratch.path("rec.mcap"),
+            out,
+            &["--boxes", boxes],
+        )
+        .json()
     };
     let (summary, _again) = (replay("first"), replay("second"));
     println!("{}", summary["counters"]);

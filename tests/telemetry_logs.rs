@@ -9,6 +9,8 @@
 #[path = "support/clients.rs"]
 #[expect(dead_code, reason = "nothing runs beside these tests")]
 mod clients;
+#[path = "support/replays.rs"]
+mod replays;
 #[path = "support/shared.rs"]
 mod shared;
 mod support;
@@ -31,7 +33,7 @@ fn read_twice(name: &str) -> Option<(Value, Value)> {
     let log = shared::shared_data(&format!("mavlink/{name}"))?;
     let clients = Clients::find()?;
     let scratch = Scratch::new();
-    let ours = scratch.replay(&log, "out", &[]).json();
+    let ours = replays::replay(&scratch, &log, "out", &[]).json();
     let theirs = clients
         .client("tlog_summary.py")
         .arg(&log)

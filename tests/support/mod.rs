@@ -77,21 +77,6 @@ impl Scratch {
         std::fs::write(&path, bytes).unwrap();
         path
     }
-
-    /// `emberfix replay` of a file, with `more` arguments; results in `out`.
-    pub fn replay(&self, recording: &Path, out: &str, more: &[&str]) -> Said {
-        let mut command = emberfix();
-        command
-            .arg("replay")
-            .arg(self.path("mission.toml"))
-            .arg(recording);
-        command
-            .arg("--out")
-            .arg(self.path(out))
-            .arg("--json")
-            .args(more);
-        Said::of(&command.output().unwrap())
-    }
 }
 
 /// A rig whose pixels can be worked out by hand.
