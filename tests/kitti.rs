@@ -300,9 +300,14 @@ fn median(mut values: Vec<f64>) -> f64 {
     values[values.len() / 2]
 }
 
-/// Ranges from and to, metres; and what a peer measured on the same set with corners of its own and
-/// semi-global matching of whole images, metres.
-const BANDS: [(u32, u32, f64); 3] = [(10, 20, 0.14), (20, 30, 0.29), (30, 50, 0.62)];
+/// Ranges from and to, metres; what a peer measured on the same set with corners of its own and
+/// semi-global matching of whole images, metres; and what this test still allows, metres: halfway to
+/// the 0.139, 0.197 and 0.440 m that the same drive gives when every attitude is inverted.
+const BANDS: [(u32, u32, f64, f64); 3] = [
+    (10, 20, 0.14, 0.12),
+    (20, 30, 0.29, 0.18),
+    (30, 50, 0.62, 0.37),
+];
 /// Fewest sightings that make a corner's median its place.
 const FEWEST: usize = 8;
 
@@ -327,7 +332,7 @@ fn figures(placed: &BTreeMap<String, Vec<Placed>>) -> Vec<Value> {
     };
     BANDS
         .into_iter()
-        .map(|(from, to, bound)| {
+        .map(|(from, to, bound, _)| {
             let distances = spread((from, to));
             let n = distances.len();
             let value = median(distances);
@@ -401,13 +406,14 @@ fn static_things_keep_one_place_while_the_car_drives_by() {
     let placed = by_label(&boxes, &fixes);
     let figures = figures(&placed);
     println!("{:#}", json!({ "figures": figures }));
-    for figure in &figures {
-        assert!(
-            figure["n"].as_u64().unwrap() >= 100,
-            "too few to say anything: {figure}"
+    for (figure, (.., allowed_m)) in figures.iter().zip(BANDS) {
+        let (value_m, n) = (
+            figure["value"].as_f64().unwrap(),
+            figure["n"].as_u64().unwrap(),
         );
-        assert_eq!(
-            figure["holds"], true,
+        assert!(n >= 100, "too few to say anything: {figure}");
+        assert!(
+            value_m < allowed_m,
             "a frame, a height or a clock drifts, or matching: {figure}"
         );
     }
