@@ -391,6 +391,7 @@ fn build(raw: RawMission, path: &Path) -> Result<Mission, MissionError> {
             confirm_span_s: raw.track.confirm_span_s,
             gnss_correlation_s: raw.sigma.gnss_correlation_s,
             heading_correlation_s: raw.sigma.heading_correlation_s,
+            mount_correlation_s: TrackConfig::default().mount_correlation_s,
             forget_suspected_s: raw.track.forget_suspected_s,
         },
         ground: GroundLinks {

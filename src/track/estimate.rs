@@ -1,44 +1,30 @@
-//! Position of one fire: a Schmidt-Kalman filter over position and terrain offset, with the shared
-//! errors considered.
-//!
-//! State: east, north, up of the fire's base in the mission plane, and by how much the ground there
-//! is above the terrain model; metres. Shared errors are in units of their own sigma (`n`, unit
-//! covariance), so that a sigma that changes in flight needs no bookkeeping.
-//!
-//! Source: S. F. Schmidt's consider filter as in Tapley, Schutz, Born, "Statistical Orbit
-//! Determination" (2004), chapter 6: with measurement `y = H x + N n + v`, covariance `P`, and
-//! cross-covariance `C = E[x n']`,
-//! `S = H P H' + H C N' + N C' H' + N N' + R`, `K = (P H' + C N') S^-1`,
-//! `P <- P - K (P H' + C N')'`, `C <- C - K (H C + N)`.
+//! Position of one fire: its sightings linearised, and taken into the [`Joint`] estimate.
 
-use super::TrackConfig;
+use super::joint::{Joint, LOCAL, PER_FIRE};
 use crate::alarm::Method;
 use crate::locate::{Fix, SHARED, Shared, Sighting, Terrain, View};
 use emberfix_frames::{
-    Coordinate, Covariance, Matrix3, Metres, MissionEnu, ServiceTime, Vector3, Wgs84Parts,
+    Coordinate, Covariance, Matrix3, Metres, MissionEnu, Vector3, Wgs84Parts,
 };
 use nalgebra::{SMatrix, SVector};
 use std::collections::BTreeSet;
 
-const STATES: usize = 4;
 const TERRAIN: usize = 3;
-type State = SVector<f64, STATES>;
+type State = SVector<f64, PER_FIRE>;
 
-/// Where a fire is, how sure, and how its error hangs together with the shared errors.
+/// Where a fire is and how sure, read off the joint estimate, and what that rests on.
 #[derive(Debug, Clone)]
 pub struct Estimate {
     state: State,
-    covariance: SMatrix<f64, STATES, STATES>,
-    with_shared: SMatrix<f64, STATES, SHARED>,
-    at: ServiceTime,
+    covariance: SMatrix<f64, PER_FIRE, PER_FIRE>,
     methods: BTreeSet<Method>,
     first_sight: Vector3<f64>,
 }
 
-/// A linearised measurement.
+/// A linearised measurement: residual to the prediction at a state and zero shared errors.
 struct Measurement<const M: usize> {
     residual: SVector<f64, M>,
-    by_state: SMatrix<f64, M, STATES>,
+    by_state: SMatrix<f64, M, PER_FIRE>,
     by_shared: SMatrix<f64, M, SHARED>,
     noise: SMatrix<f64, M, M>,
 }
@@ -55,39 +41,35 @@ const PARALLAX_RAD: f64 = 0.05;
 const SLOPE_STEP_M: f64 = 5.0;
 
 impl Estimate {
-    /// Starts from a first fix: bearing known, range diffuse; [`Estimate::refine`] then takes in
-    /// what disparity and terrain say.
+    /// Starts from a first fix, as the last fire of the joint estimate: bearing known, range
+    /// diffuse; [`Estimate::refine`] then takes in what disparity and terrain say.
     #[must_use]
     pub fn start(
         sighting: &Sighting,
         fix: &Fix,
         view: &View<'_>,
         terrain: Option<&dyn Terrain>,
+        joint: &mut Joint,
+        slot: usize,
     ) -> Option<Self> {
         let point = fix.enu.metres();
-        let sight = point - view.camera_enu;
-        let ray = sight.try_normalize(1e-6)?;
+        let ray = (point - view.camera_enu).try_normalize(1e-6)?;
         let along = ray * (DIFFUSE * fix.range_m);
         let across = view.across_covariance(&ray, fix.range_m, sighting.base_sigma_px);
-        let scale = SMatrix::<f64, SHARED, SHARED>::from_diagonal(view.shared_sigmas());
-        let mut by_shared = view.position_by_shared(&point) * scale;
-        by_shared.set_column(Shared::Disparity as usize, &Vector3::zeros());
-        let position = along * along.transpose()
-            + across.m2()
-            + by_shared * by_shared.transpose();
+        let position: Matrix3<f64> = along * along.transpose() + across.m2();
         let terrain_sigma = terrain.map_or(0.0, |t| t.sigma_m(&fix.place));
-        let mut covariance = SMatrix::<f64, STATES, STATES>::zeros();
-        covariance.fixed_view_mut::<3, 3>(0, 0).copy_from(&position);
-        covariance[(TERRAIN, TERRAIN)] = terrain_sigma * terrain_sigma;
-        let mut with_shared = SMatrix::<f64, STATES, SHARED>::zeros();
-        // The placed point is truth plus D b: its error (truth minus estimate) is minus D b.
-        with_shared.fixed_view_mut::<3, SHARED>(0, 0).copy_from(&-by_shared);
-        let state = State::new(point.x, point.y, point.z, 0.0);
+        let mut own = SMatrix::<f64, PER_FIRE, PER_FIRE>::zeros();
+        own.fixed_view_mut::<3, 3>(0, 0).copy_from(&position);
+        own[(TERRAIN, TERRAIN)] = terrain_sigma * terrain_sigma;
+        let mut placed_by_shared = scaled(view.position_by_shared(&point), view);
+        placed_by_shared.set_column(Shared::Disparity as usize, &Vector3::zeros());
+        let mut by_shared = SMatrix::<f64, PER_FIRE, SHARED>::zeros();
+        // The placed point is truth plus D n: the truth is the placed point minus D n.
+        by_shared.fixed_view_mut::<3, SHARED>(0, 0).copy_from(&-placed_by_shared);
+        joint.add(&State::new(point.x, point.y, point.z, 0.0), &by_shared, &own);
         Some(Self {
-            state,
-            covariance,
-            with_shared,
-            at: view.pose.at,
+            state: joint.fire(slot),
+            covariance: joint.between(slot, slot),
             methods: BTreeSet::new(),
             first_sight: ray,
         })
@@ -118,66 +100,61 @@ impl Estimate {
         self.methods.iter().copied().collect()
     }
 
-    /// Lets time pass: errors that wander become other errors, so what they have in common with
-    /// this fire fades.
-    pub fn age(&mut self, now: ServiceTime, config: &TrackConfig) {
-        let dt_s = (now - self.at).as_secs_f64().max(0.0);
-        self.at = now;
-        let fade = |correlation_s: f64| (-dt_s / correlation_s).exp();
-        for axis in 0..3 {
-            self.fade_column(Shared::GnssEast as usize + axis, fade(config.gnss_correlation_s));
-        }
-        self.fade_column(Shared::Heading as usize, fade(config.heading_correlation_s));
-    }
-
-    fn fade_column(&mut self, column: usize, by: f64) {
-        let faded = self.with_shared.column(column) * by;
-        self.with_shared.set_column(column, &faded);
+    /// Reads position and covariance off the joint estimate.
+    pub fn read_off(&mut self, joint: &Joint, slot: usize) {
+        self.state = joint.fire(slot);
+        self.covariance = joint.between(slot, slot);
     }
 
     /// Squared Mahalanobis distance of a sighting, its disparity included when it has one; `None`
     /// when the fire can't be seen from there.
     #[must_use]
-    pub fn distance(&self, sighting: &Sighting, view: &View<'_>) -> Option<f64> {
+    pub fn distance(
+        &self,
+        sighting: &Sighting,
+        view: &View<'_>,
+        joint: &Joint,
+        slot: usize,
+    ) -> Option<f64> {
         let m = self.optical(sighting, view, &self.state)?;
-        let spread = self.innovation(&m);
-        let solved = spread.cholesky()?.solve(&m.residual);
-        Some(m.residual.dot(&solved))
+        let residual = m.residual - m.by_shared * joint.shared();
+        let by_local = by_local(&m);
+        let spread = by_local * joint.local(slot) * by_local.transpose() + m.noise;
+        Some(residual.dot(&spread.cholesky()?.solve(&residual)))
     }
 
-    /// Squared Mahalanobis distance, horizontal, between two fires, given that their shared errors
-    /// are the same ones; `extent_m` is how large the larger of them is.
-    #[must_use]
-    pub fn distance_between(&self, other: &Self, extent_m: f64) -> f64 {
-        let common = self.with_shared * other.with_shared.transpose();
-        let spread = self.covariance + other.covariance - common - common.transpose();
-        let extent = nalgebra::Matrix2::identity() * (0.25 * extent_m * extent_m);
-        let spread = spread.fixed_view::<2, 2>(0, 0) + extent;
-        let difference = (self.state - other.state).fixed_rows::<2>(0).into_owned();
-        match spread.cholesky() {
-            Some(cholesky) => difference.dot(&cholesky.solve(&difference)),
-            None => f64::INFINITY,
-        }
-    }
-
-    /// Takes a sighting in: bearing, disparity, terrain.
-    pub fn update(&mut self, sighting: &Sighting, view: &View<'_>, terrain: Option<&dyn Terrain>) {
+    /// Takes a sighting in: bearing, disparity, terrain. The shared errors learn from it.
+    pub fn update(
+        &mut self,
+        sighting: &Sighting,
+        view: &View<'_>,
+        terrain: Option<&dyn Terrain>,
+        joint: &mut Joint,
+        slot: usize,
+    ) {
         let sight = (self.position_m() - view.camera_enu).normalize();
         if sight.angle(&self.first_sight) > PARALLAX_RAD {
             self.methods.insert(Method::Parallax);
         }
-        self.take_optical(sighting, view);
+        self.take_optical(sighting, view, joint, slot);
         self.note_stereo(sighting);
-        self.take_terrain(view, terrain);
+        self.take_terrain(view, terrain, joint, slot);
     }
 
     /// Takes disparity and terrain of the first sighting in; its bearing is in the start already.
-    pub fn refine(&mut self, sighting: &Sighting, view: &View<'_>, terrain: Option<&dyn Terrain>) {
+    pub fn refine(
+        &mut self,
+        sighting: &Sighting,
+        view: &View<'_>,
+        terrain: Option<&dyn Terrain>,
+        joint: &mut Joint,
+        slot: usize,
+    ) {
         if let Some(disparity) = self.disparity(sighting, view, &self.state) {
-            self.apply(&disparity);
+            self.apply(&disparity, joint, slot);
         }
         self.note_stereo(sighting);
-        self.take_terrain(view, terrain);
+        self.take_terrain(view, terrain, joint, slot);
     }
 
     fn note_stereo(&mut self, sighting: &Sighting) {
@@ -187,22 +164,30 @@ impl Estimate {
     }
 
     /// Iterated update: linearises anew at each better position, but counts the sighting once.
-    fn take_optical(&mut self, sighting: &Sighting, view: &View<'_>) {
+    fn take_optical(
+        &mut self,
+        sighting: &Sighting,
+        view: &View<'_>,
+        joint: &mut Joint,
+        slot: usize,
+    ) {
         let prior = self.state;
+        let covariance = joint.local(slot);
         let mut at = prior;
-        for _ in 0..PASSES {
+        for pass in 0..=PASSES {
             let Some(mut m) = self.optical(sighting, view, &at) else {
                 return;
             };
             m.residual -= m.by_state * (prior - at);
-            let Some(gain) = self.gain(&m) else {
+            if pass == PASSES {
+                self.apply(&m, joint, slot);
+                return;
+            }
+            let Some(gain) = gain(&m, &covariance) else {
                 return;
             };
-            at = prior + gain * m.residual;
-        }
-        if let Some(mut m) = self.optical(sighting, view, &at) {
-            m.residual -= m.by_state * (prior - at);
-            self.apply(&m);
+            let step = gain * (m.residual - m.by_shared * joint.shared());
+            at = prior + step.fixed_rows::<PER_FIRE>(SHARED);
         }
     }
 
@@ -224,7 +209,8 @@ impl Estimate {
         m.residual[0] = sighting.base.u - predicted.pixel.u;
         m.residual[1] = sighting.base.v - predicted.pixel.v;
         m.by_state.fixed_view_mut::<2, 3>(0, 0).copy_from(&predicted.by_position);
-        m.by_shared.fixed_view_mut::<2, SHARED>(0, 0).copy_from(&predicted.by_shared);
+        let by_shared = scaled(predicted.by_shared, view);
+        m.by_shared.fixed_rows_mut::<2>(0).copy_from(&by_shared);
         m.noise[(0, 0)] = variance(sigma_u);
         m.noise[(1, 1)] = variance(sigma_v);
         if let Some(disparity) = self.disparity(sighting, view, at) {
@@ -232,12 +218,7 @@ impl Estimate {
             m.by_state.set_row(2, &disparity.by_state.row(0));
             m.by_shared.set_row(2, &disparity.by_shared.row(0));
             m.noise[(2, 2)] = disparity.noise[(0, 0)];
-        } else {
-            m.by_shared = scaled(m.by_shared, view);
-            return Some(m);
         }
-        let optical = scaled(m.by_shared.fixed_rows::<2>(0).into_owned(), view);
-        m.by_shared.fixed_rows_mut::<2>(0).copy_from(&optical);
         Some(m)
     }
 
@@ -249,7 +230,7 @@ impl Estimate {
         let above = view.camera_enu + ray * view.range_beneath(&base, &ray)?;
         let height = (above - base).dot(view.up());
         let predicted = view.predict(&(base + view.up() * height))?;
-        let mut by_state = SMatrix::<f64, 1, STATES>::zeros();
+        let mut by_state = SMatrix::<f64, 1, PER_FIRE>::zeros();
         by_state.fixed_view_mut::<1, 3>(0, 0).copy_from(&predicted.disparity_by_position);
         Some(Measurement {
             residual: SVector::<f64, 1>::new(measured.px - predicted.disparity_px),
@@ -260,7 +241,13 @@ impl Estimate {
     }
 
     /// The base stands on the ground: up = terrain(east, north) + the fire's own terrain offset.
-    fn take_terrain(&mut self, view: &View<'_>, terrain: Option<&dyn Terrain>) {
+    fn take_terrain(
+        &mut self,
+        view: &View<'_>,
+        terrain: Option<&dyn Terrain>,
+        joint: &mut Joint,
+        slot: usize,
+    ) {
         let Some(terrain) = terrain else {
             return;
         };
@@ -273,44 +260,39 @@ impl Estimate {
             there[axis] += SLOPE_STEP_M;
             ground_up(&there, view, terrain).map_or(0.0, |up| (up - ground) / SLOPE_STEP_M)
         };
-        let by_state = SMatrix::<f64, 1, STATES>::new(-slope(0), -slope(1), 1.0, -1.0);
-        self.apply(&Measurement {
+        let by_state = SMatrix::<f64, 1, PER_FIRE>::new(-slope(0), -slope(1), 1.0, -1.0);
+        let m = Measurement {
             residual: SVector::<f64, 1>::new(ground + self.state[TERRAIN] - here.z),
             by_state,
             by_shared: SMatrix::zeros(),
             noise: SMatrix::<f64, 1, 1>::new(TERRAIN_NOISE_M * TERRAIN_NOISE_M),
-        });
+        };
+        self.apply(&m, joint, slot);
         self.methods.insert(Method::Terrain);
     }
 
-    fn innovation<const M: usize>(&self, m: &Measurement<M>) -> SMatrix<f64, M, M> {
-        let cross = m.by_state * self.with_shared * m.by_shared.transpose();
-        m.by_state * self.covariance * m.by_state.transpose()
-            + cross
-            + cross.transpose()
-            + m.by_shared * m.by_shared.transpose()
-            + m.noise
+    fn apply<const M: usize>(&mut self, m: &Measurement<M>, joint: &mut Joint, slot: usize) {
+        let residual = m.residual - m.by_shared * joint.shared();
+        joint.update(slot, &residual, &by_local(m), &m.noise);
+        self.read_off(joint, slot);
     }
+}
 
-    fn lever<const M: usize>(&self, m: &Measurement<M>) -> SMatrix<f64, STATES, M> {
-        self.covariance * m.by_state.transpose() + self.with_shared * m.by_shared.transpose()
-    }
+fn by_local<const M: usize>(m: &Measurement<M>) -> SMatrix<f64, M, LOCAL> {
+    let mut by_local = SMatrix::<f64, M, LOCAL>::zeros();
+    by_local.fixed_view_mut::<M, SHARED>(0, 0).copy_from(&m.by_shared);
+    by_local.fixed_view_mut::<M, PER_FIRE>(0, SHARED).copy_from(&m.by_state);
+    by_local
+}
 
-    fn gain<const M: usize>(&self, m: &Measurement<M>) -> Option<SMatrix<f64, STATES, M>> {
-        let inverse = self.innovation(m).try_inverse()?;
-        Some(self.lever(m) * inverse)
-    }
-
-    fn apply<const M: usize>(&mut self, m: &Measurement<M>) {
-        let Some(gain) = self.gain(m) else {
-            return;
-        };
-        let lever = self.lever(m);
-        self.state += gain * m.residual;
-        let covariance = self.covariance - gain * lever.transpose();
-        self.covariance = (covariance + covariance.transpose()) * 0.5;
-        self.with_shared -= gain * (m.by_state * self.with_shared + m.by_shared);
-    }
+fn gain<const M: usize>(
+    m: &Measurement<M>,
+    local: &SMatrix<f64, LOCAL, LOCAL>,
+) -> Option<SMatrix<f64, LOCAL, M>> {
+    let by_local = by_local(m);
+    let lever = local * by_local.transpose();
+    let inverse = (by_local * lever + m.noise).try_inverse()?;
+    Some(lever * inverse)
 }
 
 /// From units of the shared errors to units of their sigmas.

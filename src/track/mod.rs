@@ -4,19 +4,22 @@
 //! the plane at the mission datum, each with the covariance of all of its error. Pure: no I/O, no
 //! clock.
 //!
-//! **Estimation.** Bearing, disparity and terrain are fused always and switched never, by a
-//! Schmidt-Kalman filter per fire: GNSS offset, heading, tilt and boresight, disparity offset and
-//! clock offset are *considered*, with their correlation to the fire kept, so that they never
-//! average out as if they were noise. The terrain's own error is a state of each fire, so that
-//! looking twice at the same ground does not make it better known. Cost is linear in fires.
+//! **Estimation.** Bearing, disparity and terrain are fused always and switched never. GNSS offset,
+//! heading, tilt and boresight, disparity offset and clock offset are states that all fires share
+//! ([`Joint`]): what the sightings say about them is learned, what they can't say (a GNSS
+//! offset without a landmark) stays in every ellipse, and nothing averages out as if it were noise.
+//! The terrain's own error is a state of each fire, so that looking twice at the same ground does
+//! not make it better known.
 //!
-//! **Known limits.** The shared errors are considered, not yet estimated; a fire is a point with a
-//! size, not an area.
+//! **Known limits.** A fire is a point with a size, not an area. The cost of a sighting is quadratic
+//! in the fires that are kept, so at most [`MAX_FIRES`] are.
 
 mod estimate;
+mod joint;
 mod life;
 
 pub use estimate::Estimate;
+pub use joint::{Joint, MAX_FIRES};
 pub use life::Evidence;
 
 use crate::alarm::{AlarmClass, FireId, FireState, Method, SizeM};
@@ -46,6 +49,8 @@ pub struct TrackConfig {
     pub gnss_correlation_s: f64,
     /// Seconds after which heading error has become another one.
     pub heading_correlation_s: f64,
+    /// Seconds after which boresight, disparity and clock errors have become other ones.
+    pub mount_correlation_s: f64,
     /// Seconds without a sighting after which a suspected fire is forgotten.
     pub forget_suspected_s: f64,
 }
@@ -57,6 +62,7 @@ impl Default for TrackConfig {
             confirm_span_s: 1.0,
             gnss_correlation_s: 300.0,
             heading_correlation_s: 600.0,
+            mount_correlation_s: 1800.0,
             forget_suspected_s: 20.0,
         }
     }
@@ -132,6 +138,8 @@ pub struct Tracker {
     config: TrackConfig,
     fires: Vec<Fire>,
     next: FireId,
+    joint: Joint,
+    last_step: Option<ServiceTime>,
 }
 
 /// Chi-square 99.9 % for three degrees of freedom: bearing and disparity. A fire is sighted
@@ -139,10 +147,10 @@ pub struct Tracker {
 const GATE: f64 = 16.27;
 /// Chi-square 99 % for two: below it, two fires that were never seen side by side are one.
 const MERGE_GATE: f64 = 9.21;
+/// Room that is kept for the next frame's new fires.
+const ROOM: usize = 32;
 /// A fire counts as missed from up to this many times the range that it was seen from.
 const MISS_REACH: f64 = 1.1;
-/// Sightings side by side after which two fires can no longer be one.
-const SIDE_BY_SIDE: usize = 1;
 /// Smoke this close to a fire's pixel, in its own sizes, is that fire's smoke.
 const SMOKE_REACH: f64 = 0.6;
 
@@ -150,13 +158,25 @@ impl Tracker {
     /// No fires yet; the first one gets number `first`.
     #[must_use]
     pub fn new(config: TrackConfig, first: FireId) -> Self {
-        Self { config, fires: Vec::new(), next: first }
+        Self {
+            config,
+            fires: Vec::new(),
+            next: first,
+            joint: Joint::default(),
+            last_step: None,
+        }
     }
 
     /// All fires, in order of their numbers.
     #[must_use]
     pub fn fires(&self) -> &[Fire] {
         &self.fires
+    }
+
+    /// Everything that is estimated: shared errors and fires, in the order of [`Tracker::fires`].
+    #[must_use]
+    pub fn joint(&self) -> &Joint {
+        &self.joint
     }
 
     /// Takes one frame in. Sightings come back with the fire that they were given to.
@@ -166,9 +186,7 @@ impl Tracker {
         sightings: &[Classified],
         terrain: Option<&dyn Terrain>,
     ) -> Vec<Outcome> {
-        for fire in &mut self.fires {
-            fire.estimate.age(view.pose.at, &self.config);
-        }
+        self.age(view.pose.at);
         let assigned = self.associate(view, sightings);
         let mut outcomes = Vec::with_capacity(sightings.len());
         for (index, classified) in sightings.iter().enumerate() {
@@ -180,11 +198,27 @@ impl Tracker {
             };
             outcomes.push(Outcome { index, fire, fix: own });
         }
+        self.read_off();
         self.note_side_by_side(&outcomes);
         self.note_misses(view, &outcomes);
         self.merge();
         self.forget(view.pose.at);
         outcomes
+    }
+
+    /// Lets time pass since the last frame.
+    fn age(&mut self, now: ServiceTime) {
+        let dt_s = self.last_step.map_or(0.0, |last| (now - last).as_secs_f64());
+        self.last_step = Some(now);
+        self.joint.age(dt_s, &self.config);
+        self.read_off();
+    }
+
+    /// Every fire follows what was learned of the shared errors.
+    fn read_off(&mut self) {
+        for (slot, fire) in self.fires.iter_mut().enumerate() {
+            fire.estimate.read_off(&self.joint, slot);
+        }
     }
 
     /// Nearest fire in the Mahalanobis sense for each sighting, each fire at most once.
@@ -195,7 +229,7 @@ impl Tracker {
                 if fire.class != classified.class || fire.merged_into.is_some() {
                     continue;
                 }
-                if let Some(distance) = fire.estimate.distance(&classified.sighting, view)
+                if let Some(distance) = fire.estimate.distance(&classified.sighting, view, &self.joint, slot)
                     && distance < GATE
                 {
                     pairs.push((distance, index, slot));
@@ -259,7 +293,8 @@ impl Tracker {
         terrain: Option<&dyn Terrain>,
     ) -> FireId {
         let fire = &mut self.fires[slot];
-        fire.estimate.update(&classified.sighting, view, terrain);
+        fire.estimate.read_off(&self.joint, slot);
+        fire.estimate.update(&classified.sighting, view, terrain, &mut self.joint, slot);
         fire.evidence.hit(classified.score);
         fire.last_seen = classified.sighting.at;
         note_extent(fire, &classified.sighting, view);
@@ -283,8 +318,13 @@ impl Tracker {
         view: &View<'_>,
         terrain: Option<&dyn Terrain>,
     ) -> Option<FireId> {
-        let mut estimate = Estimate::start(&classified.sighting, own, view, terrain)?;
-        estimate.refine(&classified.sighting, view, terrain);
+        if self.fires.len() >= MAX_FIRES {
+            return None;
+        }
+        let (joint, slot) = (&mut self.joint, self.fires.len());
+        let sighting = &classified.sighting;
+        let mut estimate = Estimate::start(sighting, own, view, terrain, joint, slot)?;
+        estimate.refine(sighting, view, terrain, joint, slot);
         let id = self.next;
         self.next = FireId(id.0.saturating_add(1));
         let mut fire = Fire {
@@ -344,24 +384,57 @@ impl Tracker {
     fn are_one(&self, elder: usize, younger: usize) -> bool {
         let (a, b) = (&self.fires[elder], &self.fires[younger]);
         let open = |fire: &Fire| fire.merged_into.is_none() && fire.state != FireState::Out;
-        let apart = a.beside.iter().filter(|id| **id == b.id).count();
         a.class == b.class
             && open(a)
             && open(b)
-            && apart < SIDE_BY_SIDE
-            && a.estimate.distance_between(&b.estimate, extent_m(a).max(extent_m(b))) < MERGE_GATE
+            && !a.beside.contains(&b.id)
+            && self.distance_between(elder, younger) < MERGE_GATE
+    }
+
+    /// Squared Mahalanobis distance, horizontal, between two fires. They have the shared errors in
+    /// common, and their own extent: two boxes on one wide fire need not have the same base.
+    fn distance_between(&self, a: usize, b: usize) -> f64 {
+        let joint = &self.joint;
+        let common = joint.between(a, b);
+        let spread = joint.between(a, a) + joint.between(b, b) - common - common.transpose();
+        let extent_m = extent_m(&self.fires[a]).max(extent_m(&self.fires[b]));
+        let extent = nalgebra::Matrix2::identity() * (0.25 * extent_m * extent_m);
+        let spread = spread.fixed_view::<2, 2>(0, 0) + extent;
+        let apart = (joint.fire(a) - joint.fire(b)).fixed_rows::<2>(0).into_owned();
+        spread.cholesky().map_or(f64::INFINITY, |spread| apart.dot(&spread.solve(&apart)))
     }
 
     fn forget(&mut self, now: ServiceTime) {
         let limit_s = self.config.forget_suspected_s;
         let merged_early =
             |fire: &Fire| fire.merged_into.is_some() && !fire.evidence.was_convincing();
-        self.fires.retain(|fire| {
+        let over = |fire: &Fire| {
             let age_s = (now - fire.last_seen).as_secs_f64();
-            let forgettable = fire.state == FireState::Suspected
-                && (age_s > limit_s || fire.evidence.is_refuted());
-            !forgettable && !merged_early(fire)
-        });
+            fire.state == FireState::Suspected
+                && (age_s > limit_s || fire.evidence.is_refuted())
+        };
+        for slot in (0..self.fires.len()).rev() {
+            let fire = &self.fires[slot];
+            if over(fire) || merged_early(fire) {
+                self.remove(slot);
+            }
+        }
+        while self.fires.len() > MAX_FIRES - ROOM && self.forget_weakest().is_some() {}
+    }
+
+    /// Makes room: the suspected fire with the least evidence goes. `None` when all are confirmed.
+    fn forget_weakest(&mut self) -> Option<()> {
+        let suspected = self.fires.iter().enumerate().filter(|(_, fire)| !fire.is_confirmed());
+        let probability = |fire: &Fire| fire.evidence.probability();
+        let weakest = suspected.min_by(|a, b| probability(a.1).total_cmp(&probability(b.1)));
+        let slot = weakest.map(|(slot, _)| slot)?;
+        self.remove(slot);
+        Some(())
+    }
+
+    fn remove(&mut self, slot: usize) {
+        self.fires.remove(slot);
+        self.joint.remove(slot);
     }
 }
 
