@@ -8,7 +8,7 @@ use crate::locate::{ConstantPlane, SharedSigmas, Terrain};
 use crate::pose::PoseConfig;
 use crate::range::SgbmConfig;
 use crate::track::TrackConfig;
-use emberfix_calib::{Checks, KeyProblem, Rig, RigError, unknown_keys};
+use emberfix_calib::{Checks, KeyProblem, Rig, RigError, toml_problem, unknown_keys};
 use emberfix_frames::{EllipsoidHeight, Wgs84, place_from_degrees};
 use serde::Deserialize;
 use std::path::{Path, PathBuf};
@@ -285,7 +285,7 @@ impl Mission {
 fn parse(text: &str, path: &Path) -> Result<RawMission, MissionError> {
     let syntax = |error: toml::de::Error| MissionError::Syntax {
         path: path.to_owned(),
-        message: error.to_string().trim_end().to_owned(),
+        message: toml_problem(text, &error),
     };
     let values = |problems| MissionError::Values { path: path.to_owned(), problems };
     let table: toml::Table = toml::from_str(text).map_err(syntax)?;
@@ -334,9 +334,12 @@ fn check(raw: &RawMission) -> Vec<String> {
 fn check_numbers(checks: &mut Checks, raw: &RawMission) {
     let model = detector(&raw.model, &Path::to_owned).problems();
     let range = range(&raw.range).problems();
-    let named = |table: &'static str| move |problem: String| format!("{table}.{problem}");
-    model.into_iter().map(named("model")).for_each(|problem| checks.problem(problem));
-    range.into_iter().map(named("range")).for_each(|problem| checks.problem(problem));
+    model.into_iter().for_each(|problem| checks.problem(format!("model.{problem}")));
+    for problem in range {
+        // The mission says what the number is for, the matcher what OpenCV calls it.
+        let problem = problem.replace("num_disparities", "max_disparity_px");
+        checks.problem(format!("range.{problem}"));
+    }
 }
 
 fn check_sigma(checks: &mut Checks, sigma: &RawSigma) {

@@ -105,6 +105,7 @@ impl Replay {
             "mission": self.mission_name,
             "recording": file_name,
             "pairs": pairs,
+            "stream": self.recording.counters(),
             "counters": self.pipeline.counters(),
         }))
     }

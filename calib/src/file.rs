@@ -1,6 +1,8 @@
 //! The rig file: raw TOML to a checked [`Rig`], every problem at once.
 
-use crate::{Camera, Checks, Eye, KeyProblem, Rectification, Rig, RigSigmas, unknown_keys};
+use crate::{
+    Camera, Checks, Eye, KeyProblem, Rectification, Rig, RigSigmas, toml_problem, unknown_keys,
+};
 use emberfix_frames::{Metres, MountAngles, Vector, Vector3};
 use serde::Deserialize;
 use std::path::{Path, PathBuf};
@@ -122,7 +124,7 @@ pub(crate) fn load(path: &Path) -> Result<Rig, RigError> {
 pub(crate) fn parse(text: &str, path: &Path) -> Result<Rig, RigError> {
     let syntax = |error: toml::de::Error| RigError::Syntax {
         path: path.to_owned(),
-        message: one_line(text, &error),
+        message: toml_problem(text, &error),
     };
     let table: toml::Table = toml::from_str(text).map_err(syntax)?;
     let unknown: Vec<String> =
@@ -139,19 +141,6 @@ pub(crate) fn parse(text: &str, path: &Path) -> Result<Rig, RigError> {
         return Err(values(path, problems));
     }
     build(raw, path)
-}
-
-/// What the TOML reader says, with the line that it says it of.
-fn one_line(text: &str, error: &toml::de::Error) -> String {
-    let message = error.message().replace('\n', ", ");
-    match error.span().and_then(|span| text.get(..span.start)) {
-        Some(before) => {
-            let number = before.matches('\n').count();
-            let line = text.lines().nth(number).unwrap_or_default().trim();
-            format!("line {} ({line}): {message}", number + 1)
-        }
-        None => message,
-    }
 }
 
 fn values(path: &Path, problems: Vec<String>) -> RigError {

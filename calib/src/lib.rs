@@ -14,7 +14,7 @@ mod rectify;
 mod tests;
 
 pub use file::RigError;
-pub use nearest::{Checks, KeyProblem, nearest_key, unknown_keys};
+pub use nearest::{Checks, KeyProblem, nearest_key, toml_problem, unknown_keys};
 pub use rectify::Rectification;
 
 use emberfix_frames::{

@@ -102,6 +102,20 @@ impl Checks {
     }
 }
 
+/// What the TOML reader says, in one line, with the line of the file that it says it of.
+#[must_use]
+pub fn toml_problem(text: &str, error: &toml::de::Error) -> String {
+    let message = error.message().replace('\n', ", ");
+    let before = error.span().and_then(|span| text.get(..span.start));
+    // A key that is missing from the whole file is said of its first byte.
+    let Some(before) = before.filter(|before| !before.is_empty()) else {
+        return message;
+    };
+    let number = before.matches('\n').count();
+    let line = text.lines().nth(number).unwrap_or_default().trim();
+    format!("line {} ({line}): {message}", number + 1)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

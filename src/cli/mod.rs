@@ -6,9 +6,11 @@
 mod replay;
 mod run;
 
-
+use crate::detect::{self, BoxFileDetector, Detector};
+use crate::mission::Mission;
 use clap::{Parser, Subcommand};
-use std::path::PathBuf;
+use std::io::IsTerminal;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 /// Finds fire from a UAV's stereo camera and tells the ground where it is, and how sure.
@@ -70,6 +72,7 @@ pub fn main() -> ExitCode {
             tracing_subscriber::EnvFilter::try_from_env("EMBERFIX_LOG")
                 .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info,ort=warn")),
         )
+        .with_ansi(std::io::stderr().is_terminal())
         .with_writer(std::io::stderr)
         .init();
     let done = match arguments.command {
@@ -80,14 +83,38 @@ pub fn main() -> ExitCode {
     match done {
         Ok(()) => ExitCode::SUCCESS,
         Err(Failure::Refused(error)) => {
-            eprintln!("emberfix: {error:#}");
+            eprintln!("emberfix: {}", in_one_line(&error));
             ExitCode::from(2)
         }
         Err(Failure::Failed(error)) => {
-            eprintln!("emberfix: {error:#}");
+            eprintln!("emberfix: {}", in_one_line(&error));
             ExitCode::FAILURE
         }
     }
+}
+
+/// An error and what caused it, leaving out causes that it has told already.
+fn in_one_line(error: &anyhow::Error) -> String {
+    let mut line = String::new();
+    for cause in error.chain().map(ToString::to_string) {
+        if line.is_empty() {
+            line = cause;
+        } else if !line.contains(&cause) {
+            line = format!("{line}: {cause}");
+        }
+    }
+    line.replace('\n', " ")
+}
+
+/// The mission's model, or given boxes in its place.
+pub(crate) fn detector(
+    mission: &Mission,
+    boxes: Option<&Path>,
+) -> Result<Box<dyn Detector>, Failure> {
+    Ok(match boxes {
+        Some(path) => Box::new(BoxFileDetector::load(path).map_err(Failure::refused)?),
+        None => detect::open(&mission.detector).map_err(Failure::refused)?,
+    })
 }
 
 /// A runtime for the commands that talk.

@@ -1,11 +1,10 @@
 //! `emberfix replay MISSION RECORDING --out DIR`.
 
-use super::Failure;
+use super::{Failure, detector};
 use crate::mission::Mission;
 use crate::pipeline::Pipeline;
 use crate::replay::{Replay, ReplayError, telemetry_log};
 use crate::alarm::FireId;
-use crate::detect;
 use crate::range::SgbmRanger;
 use indicatif::{ProgressBar, ProgressStyle};
 use std::path::{Path, PathBuf};
@@ -51,10 +50,7 @@ fn images_and_telemetry(
     mission: &Mission,
     arguments: &ReplayArguments,
 ) -> Result<Result<serde_json::Value, ReplayError>, Failure> {
-    let detector: Box<dyn detect::Detector> = match &arguments.boxes {
-        Some(path) => Box::new(detect::BoxFileDetector::load(path).map_err(Failure::refused)?),
-        None => detect::open(&mission.detector).map_err(Failure::refused)?,
-    };
+    let detector = detector(mission, arguments.boxes.as_deref())?;
     let ranger = SgbmRanger::new(&mission.rig, mission.range.clone()).map_err(Failure::refused)?;
     let pipeline = Pipeline::new(mission, detector, Box::new(ranger), FireId(1));
     let replay = Replay::open(&arguments.recording, mission, pipeline);

@@ -1,6 +1,6 @@
 //! `emberfix run MISSION`.
 
-use super::{Failure, runtime};
+use super::{Failure, detector, runtime};
 use crate::mission::Mission;
 use crate::pipeline::Pipeline;
 use crate::range::SgbmRanger;
@@ -24,6 +24,9 @@ pub struct RunArguments {
     /// Folder for what must survive (the outbox) instead of the mission's.
     #[arg(long)]
     state: Option<PathBuf>,
+    /// Boxes from a file (JSON lines or CSV) instead of the mission's model.
+    #[arg(long)]
+    boxes: Option<PathBuf>,
     /// Record everything that comes and everything that is found into this MCAP file.
     #[arg(long)]
     record: Option<PathBuf>,
@@ -44,7 +47,7 @@ pub fn run(arguments: RunArguments) -> Result<(), Failure> {
     if let Some(folder) = arguments.state {
         mission.state_dir = folder;
     }
-    let detector = crate::detect::open(&mission.detector).map_err(Failure::refused)?;
+    let detector = detector(&mission, arguments.boxes.as_deref())?;
     let ranger = SgbmRanger::new(&mission.rig, mission.range.clone()).map_err(Failure::refused)?;
     let fail = |error: ServiceError| {
         if error.is_refusal() { Failure::refused(error) } else { Failure::failed(error) }

@@ -1,7 +1,7 @@
 //! The ground station's configuration file: raw TOML to a checked [`GroundConfig`], every problem
 //! at once.
 
-use emberfix_calib::{KeyProblem, unknown_keys};
+use emberfix_calib::{KeyProblem, toml_problem, unknown_keys};
 use emberfix_mav::{LinkUrl, LinkUrlError};
 use serde::Deserialize;
 use std::net::SocketAddr;
@@ -149,7 +149,7 @@ impl GroundConfig {
     pub fn parse(text: &str, path: &Path, overrides: Overrides) -> Result<Self, ConfigError> {
         let syntax = |error: toml::de::Error| ConfigError::Syntax {
             path: path.to_owned(),
-            message: error.to_string().trim_end().to_owned(),
+            message: toml_problem(text, &error),
         };
         let refuse = |problems| {
             Err(ConfigError::Values {

@@ -131,7 +131,7 @@ pub struct SourceCounters {
 }
 
 /// What stood in MCAP streams: used, ignored, refused. Each refusal has its own counter.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize)]
 pub struct StreamCounters {
     /// Pairs with both eyes.
     pub pairs: u64,
@@ -285,6 +285,24 @@ impl SourceError {
             | Self::Layout { .. }
             | Self::FileName { .. }
             | Self::Times { .. } => true,
+        }
+    }
+
+    /// True when the input itself is refused (it is not there, or not what it should be), false when
+    /// a device or a port fails.
+    #[must_use]
+    pub fn is_refusal(&self) -> bool {
+        match self {
+            Self::NotMcap { .. }
+            | Self::NothingRecorded { .. }
+            | Self::Layout { .. }
+            | Self::FileName { .. }
+            | Self::Times { .. } => true,
+            Self::Io { source, .. } => source.kind() == std::io::ErrorKind::NotFound,
+            Self::NoFrames { .. }
+            | Self::Capture { .. }
+            | Self::NotOpened { .. }
+            | Self::FrameSize { .. } => false,
         }
     }
 }

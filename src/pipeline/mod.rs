@@ -6,8 +6,8 @@
 //! drops (pairs that a newer one replaced) never becomes an event, so a recording of the events
 //! replays to the same alarms.
 //!
-//! **Bound.** One pair waits for the telemetry that follows its shutter; a newer one replaces it,
-//! and that is counted.
+//! **Bound.** One pair waits for the telemetry that follows its shutter, for at most 250 ms; one that
+//! comes meanwhile is not looked at, and counted.
 
 mod counters;
 mod feature;
@@ -87,7 +87,8 @@ pub struct Pipeline {
     last_pair_at: Option<ServiceTime>,
     last_look: Option<ServiceTime>,
     last_position: Option<ServiceTime>,
-    no_pose: Option<String>,
+    /// Why the latest pair gave nothing.
+    blind: Option<String>,
     now: ServiceTime,
     counters: Counters,
     degraded: Vec<&'static str>,
@@ -127,7 +128,7 @@ impl Pipeline {
             last_pair_at: None,
             last_look: None,
             last_position: None,
-            no_pose: None,
+            blind: Some("no pair has been looked at yet".to_owned()),
             now: ServiceTime::from_unix_ns(0),
             counters: Counters::default(),
             degraded: Vec::new(),
@@ -179,7 +180,7 @@ impl Pipeline {
         if silent(self.last_look) {
             problems.push("no stereo pairs".to_owned());
         }
-        problems.extend(self.no_pose.clone());
+        problems.extend(self.blind.clone());
         Health { problems }
     }
 
@@ -258,8 +259,12 @@ impl Pipeline {
         }
         self.last_pair_at = Some(pair.at);
         self.last_look = Some(self.now);
-        if self.waiting.replace(pair).is_some() {
-            self.counters.add("pairs", "replaced_while_waiting");
+        // The older one stays: if newer ones took its place, a camera that is quicker than the wait
+        // for telemetry would never be looked through, and a stale pose would never be named.
+        if self.waiting.is_some() {
+            self.counters.add("pairs", "came_while_waiting");
+        } else {
+            self.waiting = Some(pair);
         }
     }
 
@@ -274,7 +279,7 @@ impl Pipeline {
                 Vec::new()
             }
             PoseAnswer::Fresh(pose) => {
-                self.no_pose = None;
+                self.blind = None;
                 self.look(&pair, &pose)
             }
             PoseAnswer::NeverSeen { what } => self.without_pose("pose_never_seen", || {
@@ -291,12 +296,13 @@ impl Pipeline {
 
     fn without_pose(&mut self, why: &'static str, words: impl FnOnce() -> String) -> Vec<Output> {
         self.counters.add("pairs_without_pose", why);
-        self.no_pose = Some(words());
+        self.blind = Some(words());
         Vec::new()
     }
 
     fn look(&mut self, pair: &Stamped<StereoPair>, pose: &Pose) -> Vec<Output> {
         let Some(seen) = self.vision.look(pair, &mut self.counters) else {
+            self.blind = Some("the latest pair could not be looked at".to_owned());
             return Vec::new();
         };
         let rig = Arc::clone(&self.rig);

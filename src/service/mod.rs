@@ -83,7 +83,15 @@ impl ServiceError {
     /// True when the configuration was refused, false when the work failed.
     #[must_use]
     pub fn is_refusal(&self) -> bool {
-        matches!(self, Self::MavlinkUrl(_) | Self::CameraUrl(_) | Self::GroundUrl(_))
+        match self {
+            Self::MavlinkUrl(_) | Self::CameraUrl(_) | Self::GroundUrl(_) => true,
+            Self::Camera(error) => error.is_refusal(),
+            Self::Mavlink(_)
+            | Self::Outbox(_)
+            | Self::Record(_)
+            | Self::Folder { .. }
+            | Self::Thread { .. } => false,
+        }
     }
 }
 
