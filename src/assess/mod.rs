@@ -1,12 +1,11 @@
 //! How a fire changes: size in metres, intensity, trend. Pure: no I/O, no clock.
 //!
-//! **In:** a sighting and the fire's position. **Out:** [`SizeM`] in metres.
-//! **Known limits.** Size only; intensity and trend are not assessed yet, and the alarm says so
-//! with `null`.
+//! **In:** sightings and the fire's position. **Out:** [`SizeM`] in metres; whether a light flickers.
+//! **Known limits.** Intensity and trend are not assessed yet, and the alarm says so with `null`.
 
 use crate::alarm::SizeM;
 use crate::locate::{Sighting, View};
-use emberfix_frames::Vector3;
+use emberfix_frames::{ServiceTime, Vector3};
 
 /// Share of a new size that is taken over: flames flicker, boxes jitter.
 const GAIN: f64 = 0.2;
@@ -39,5 +38,78 @@ pub fn smoothed_size(old: Option<SizeM>, new: SizeM) -> SizeM {
             width: old.width + GAIN * (new.width - old.width),
             height: old.height + GAIN * (new.height - old.height),
         },
+    }
+}
+
+/// Grey level (mean of red and green) that a sunlit scene rarely exceeds and a flame does.
+pub const PLAIN_LEVEL: f64 = 150.0;
+
+/// How a light changes from look to look.
+///
+/// A flame flickers at 1 to 15 Hz, so two looks a fraction of a second apart see different light:
+/// on flames of up to 2 m the relative change is 0.1 to 0.25, on lamps and glints that keep still
+/// 0.02 to 0.05 (noise and the change of view). Larger fires flicker less as a whole, since their
+/// tongues are independent; so this speaks of small lights only.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Flicker {
+    last: Option<(ServiceTime, f64)>,
+    changes: u32,
+    sum: f64,
+}
+
+/// Looks further apart than this say nothing about flicker: the view has changed too, seconds.
+const FLICKER_GAP_S: f64 = 1.5;
+/// Changes before a light is judged.
+const FLICKER_LOOKS: u32 = 3;
+/// Mean relative change below which a light is steady.
+const STEADY: f64 = 0.06;
+/// A light larger than this is not judged, metres.
+const SMALL_LIGHT_M: f64 = 2.0;
+
+impl Flicker {
+    /// Takes in the light of one look: `glow` as in [`Sighting::glow`], seen from `range_m`.
+    pub fn add(&mut self, at: ServiceTime, glow: f64, range_m: f64) {
+        let light = (glow * range_m * range_m).max(f64::MIN_POSITIVE).ln();
+        if let Some((before, old)) = self.last
+            && (at - before).as_secs_f64() < FLICKER_GAP_S
+        {
+            self.changes = self.changes.saturating_add(1);
+            self.sum += (light - old).abs().min(1.0);
+        }
+        self.last = Some((at, light));
+    }
+
+    /// A small light that does not flicker: a lamp, not a flame.
+    #[must_use]
+    pub fn is_lamp(&self, size: Option<SizeM>) -> bool {
+        let small = size.is_some_and(|size| size.width.max(size.height) < SMALL_LIGHT_M);
+        small && self.changes >= FLICKER_LOOKS && self.sum < STEADY * f64::from(self.changes)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use emberfix_frames::SignedDuration;
+
+    fn watch(light: impl Fn(i64) -> f64) -> Flicker {
+        let mut flicker = Flicker::default();
+        for look in 0..8 {
+            let at = ServiceTime::from_unix_ns(0) + SignedDuration::from_millis(400 * look);
+            let range_m = 20.0 - look as f64;
+            flicker.add(at, light(look) / (range_m * range_m), range_m);
+        }
+        flicker
+    }
+
+    #[test]
+    fn a_lamp_is_steady_while_we_come_nearer_and_a_flame_is_not() {
+        let small = Some(SizeM { width: 0.6, height: 0.8 });
+        let large = Some(SizeM { width: 6.0, height: 4.0 });
+        let lamp = watch(|look| 5000.0 * (1.0 + 0.01 * (look % 2) as f64));
+        let flame = watch(|look| 5000.0 * (1.0 + 0.3 * (look % 3) as f64));
+        assert!(lamp.is_lamp(small) && !flame.is_lamp(small));
+        assert!(!lamp.is_lamp(large), "large fires flicker little as a whole");
+        assert!(!Flicker::default().is_lamp(small), "nothing seen, nothing judged");
     }
 }

@@ -33,6 +33,9 @@ pub struct Sighting {
     pub size_px: (f64, f64),
     /// Disparity of the flame, if stereo gave one.
     pub disparity: Option<DisparityOf>,
+    /// Light of the box above a plain scene: sum over its pixels of what they exceed
+    /// [`crate::assess::PLAIN_LEVEL`] by, grey levels times pixels.
+    pub glow: Option<f64>,
     /// Depth that stereo excludes: nearer than this it would have been measured, metres.
     pub at_least_m: Option<f64>,
 }

@@ -121,6 +121,7 @@ fn sighting(view: &View<'_>, base: &Vector3<f64>, height_m: f64) -> Sighting {
             sigma_px: 0.1,
             centroid: middle.pixel,
         }),
+        glow: None,
         at_least_m: None,
     }
 }

@@ -2,6 +2,7 @@
 
 use super::Counters;
 use crate::alarm::AlarmClass;
+use crate::assess::PLAIN_LEVEL;
 use crate::detect::{BoxPx, Detection, DetectionClass, Detector, LeftImage};
 use crate::ingest::{EncodedImage, EyeHealth, EyeWatch, ImageDecoder, StereoPair};
 use crate::locate::{DisparityOf, Sighting};
@@ -9,7 +10,8 @@ use crate::range::{Ranger, Ranging, RawPair, Target};
 use crate::track::Classified;
 use emberfix_calib::{Eye, RawPixel, RectifiedPixel, Rig};
 use emberfix_frames::Stamped;
-use opencv::core::Mat;
+use opencv::core::{Mat, MatTraitConst};
+use opencv::prelude::MatTraitConstManual;
 use std::sync::Arc;
 
 /// What one pair showed.
@@ -33,6 +35,8 @@ pub struct Vision {
     ranger: Box<dyn Ranger>,
 }
 
+/// Margin about a box for its light, as a share of the box: box edges jitter, light must not.
+const GLOW_MARGIN: f64 = 0.25;
 /// Jitter of a box's edges: pixels at least, and as a share of the box.
 const EDGE_PX: f64 = 2.0;
 const EDGE_SHARE: f64 = 0.1;
@@ -155,9 +159,29 @@ impl Vision {
             base_sigma_px: (EDGE_PX.max(EDGE_SHARE * size_px.0), EDGE_PX.max(EDGE_SHARE * size_px.1)),
             size_px,
             disparity,
+            glow: glow(&pair.left_bgr, box_px),
             at_least_m,
         })
     }
+}
+
+/// Light of a box and a margin about it above a plain scene (see [`Sighting::glow`]).
+fn glow(bgr: &Mat, box_px: &BoxPx) -> Option<f64> {
+    let margin = |length: f64| GLOW_MARGIN * length;
+    let clamp = |value: f64, size: i32| (value.round() as i32).clamp(0, size);
+    let left = clamp(box_px.x - margin(box_px.width), bgr.cols());
+    let right = clamp(box_px.x + box_px.width + margin(box_px.width), bgr.cols());
+    let upper = clamp(box_px.y - margin(box_px.height), bgr.rows());
+    let lower = clamp(box_px.y + box_px.height + margin(box_px.height), bgr.rows());
+    let mut sum = 0.0;
+    for row in upper..lower {
+        let pixels = bgr.at_row::<opencv::core::Vec3b>(row).ok()?;
+        for pixel in pixels.get(left as usize..right as usize)? {
+            let level = (f64::from(pixel[1]) + f64::from(pixel[2])) / 2.0;
+            sum += (level - PLAIN_LEVEL).max(0.0);
+        }
+    }
+    Some(sum)
 }
 
 fn name_of(ranging: &Ranging) -> &'static str {

@@ -89,6 +89,8 @@ pub struct Fire {
     pub range_m: f64,
     /// Extent, smoothed over sightings.
     pub size_m: Option<SizeM>,
+    /// How its light changes from look to look.
+    pub flicker: crate::assess::Flicker,
     /// Number of the fire that this one turned out to be, if it did.
     pub merged_into: Option<FireId>,
     furthest_m: f64,
@@ -302,7 +304,9 @@ impl Tracker {
         let enough = fire.evidence.hits() >= self.config.confirm_sightings
             && span_s >= self.config.confirm_span_s;
         match fire.state {
-            FireState::Suspected if enough && fire.evidence.is_convincing() => {
+            FireState::Suspected
+                if enough && fire.evidence.is_convincing() && !fire.flicker.is_lamp(fire.size_m) =>
+            {
                 fire.state = FireState::Confirmed;
             }
             FireState::Out if fire.evidence.is_convincing() => fire.state = FireState::Confirmed,
@@ -337,6 +341,7 @@ impl Tracker {
             last_seen: classified.sighting.at,
             range_m: own.range_m,
             size_m: None,
+            flicker: crate::assess::Flicker::default(),
             merged_into: None,
             furthest_m: own.range_m,
             beside: BTreeSet::new(),
@@ -446,6 +451,9 @@ fn note_extent(fire: &mut Fire, sighting: &Sighting, view: &View<'_>) {
     let position: Vector3<f64> = fire.estimate.position_m();
     fire.range_m = (position - view.camera_enu).norm();
     fire.furthest_m = fire.furthest_m.max(fire.range_m);
+    if let Some(glow) = sighting.glow {
+        fire.flicker.add(sighting.at, glow, fire.range_m);
+    }
     if let Some(now) = crate::assess::size(sighting, view, &position) {
         fire.size_m = Some(crate::assess::smoothed_size(fire.size_m, now));
     }

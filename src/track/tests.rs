@@ -113,6 +113,7 @@ impl Flight {
                     sigma_px: DISPARITY_SIGMA_PX,
                     centroid: middle.pixel,
                 }),
+                glow: None,
                 at_least_m: None,
             },
             class: AlarmClass::Fire,
