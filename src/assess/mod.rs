@@ -54,15 +54,19 @@ pub const PLAIN_LEVEL: f64 = 150.0;
 pub struct Flicker {
     last: Option<(ServiceTime, f64)>,
     changes: u32,
-    sum: f64,
+    small_changes: u32,
 }
 
 /// Looks further apart than this say nothing about flicker: the view has changed too, seconds.
 const FLICKER_GAP_S: f64 = 1.5;
 /// Changes before a light is judged.
-const FLICKER_LOOKS: u32 = 3;
-/// Mean relative change below which a light is steady.
-const STEADY: f64 = 0.06;
+const FLICKER_LOOKS: u32 = 6;
+/// Relative change below which a look saw the same light: noise, and the change of view.
+const SAME_LIGHT: f64 = 0.08;
+/// Share of such looks from which a light is steady. A flame has one look in three of that kind at most, a lamp five in six.
+const STEADY_SHARE: f64 = 0.6;
+/// Sightings after which a light that could not be judged counts as a flame.
+pub const ENOUGH_SIGHTINGS: u32 = 12;
 /// A light larger than this is not judged, metres.
 const SMALL_LIGHT_M: f64 = 2.0;
 
@@ -74,16 +78,20 @@ impl Flicker {
             && (at - before).as_secs_f64() < FLICKER_GAP_S
         {
             self.changes = self.changes.saturating_add(1);
-            self.sum += (light - old).abs().min(1.0);
+            self.small_changes += u32::from((light - old).abs() < SAME_LIGHT);
         }
         self.last = Some((at, light));
     }
 
-    /// A small light that does not flicker: a lamp, not a flame.
+    /// A small light that has not been seen to flicker: it may be a lamp. One that was never seen
+    /// often enough in a row to tell gets the benefit of the doubt after [`ENOUGH_SIGHTINGS`].
     #[must_use]
-    pub fn is_lamp(&self, size: Option<SizeM>) -> bool {
+    pub fn may_be_lamp(&self, size: Option<SizeM>, sightings: u32) -> bool {
         let small = size.is_some_and(|size| size.width.max(size.height) < SMALL_LIGHT_M);
-        small && self.changes >= FLICKER_LOOKS && self.sum < STEADY * f64::from(self.changes)
+        let steady =
+            f64::from(self.small_changes) >= STEADY_SHARE * f64::from(self.changes);
+        let unjudged = self.changes < FLICKER_LOOKS;
+        small && if unjudged { sightings < ENOUGH_SIGHTINGS } else { steady }
     }
 }
 
@@ -108,8 +116,9 @@ mod tests {
         let large = Some(SizeM { width: 6.0, height: 4.0 });
         let lamp = watch(|look| 5000.0 * (1.0 + 0.01 * (look % 2) as f64));
         let flame = watch(|look| 5000.0 * (1.0 + 0.3 * (look % 3) as f64));
-        assert!(lamp.is_lamp(small) && !flame.is_lamp(small));
-        assert!(!lamp.is_lamp(large), "large fires flicker little as a whole");
-        assert!(!Flicker::default().is_lamp(small), "nothing seen, nothing judged");
+        assert!(lamp.may_be_lamp(small, 8) && !flame.may_be_lamp(small, 8));
+        assert!(!lamp.may_be_lamp(large, 8), "large fires flicker little as a whole");
+        assert!(Flicker::default().may_be_lamp(small, 4), "not judged yet");
+        assert!(!Flicker::default().may_be_lamp(small, 12), "never judged: a flame");
     }
 }

@@ -20,6 +20,7 @@ pub fn sighting(
         "confidence": classified.score,
         "captured_at": classified.sighting.at.rfc3339(),
         "box_px": [box_px.x, box_px.y, box_px.width, box_px.height],
+        "glow": classified.sighting.glow,
         "disparity_px": classified.sighting.disparity.map(|disparity| disparity.px),
     });
     let (Some(fix), Some(situation)) = (&outcome.fix, situation) else {

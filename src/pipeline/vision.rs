@@ -165,7 +165,7 @@ impl Vision {
     }
 }
 
-/// Light of a box and a margin about it above a plain scene (see [`Sighting::glow`]).
+/// Light of a box and a margin about it (see [`Sighting::glow`]).
 fn glow(bgr: &Mat, box_px: &BoxPx) -> Option<f64> {
     let margin = |length: f64| GLOW_MARGIN * length;
     let clamp = |value: f64, size: i32| (value.round() as i32).clamp(0, size);

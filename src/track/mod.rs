@@ -305,7 +305,9 @@ impl Tracker {
             && span_s >= self.config.confirm_span_s;
         match fire.state {
             FireState::Suspected
-                if enough && fire.evidence.is_convincing() && !fire.flicker.is_lamp(fire.size_m) =>
+                if enough
+                    && fire.evidence.is_convincing()
+                    && !fire.flicker.may_be_lamp(fire.size_m, fire.evidence.hits()) =>
             {
                 fire.state = FireState::Confirmed;
             }

@@ -113,7 +113,7 @@ impl Flight {
                     sigma_px: DISPARITY_SIGMA_PX,
                     centroid: middle.pixel,
                 }),
-                glow: None,
+                glow: Some(1000.0 * (1.0 + self.dice.normal(0.3).abs())),
                 at_least_m: None,
             },
             class: AlarmClass::Fire,
@@ -199,11 +199,11 @@ fn a_fire_that_is_gone_ends_and_a_single_flash_is_forgotten() {
         let view = View::new(&flight.rig, &reported, &SIGMAS, &datum);
         tracker.step(&view, seen.as_slice(), None);
     };
-    for i in 0..8 {
+    for i in 0..10 {
         step(&mut flight, &mut tracker, i, true);
     }
     assert_eq!(tracker.fires()[0].state, FireState::Confirmed);
-    for i in 8..40 {
+    for i in 10..45 {
         step(&mut flight, &mut tracker, i, false);
     }
     assert_eq!(tracker.fires()[0].state, FireState::Out);
