@@ -220,7 +220,11 @@ struct RawGround {
 
 impl Default for RawGround {
     fn default() -> Self {
-        Self { url: None, agent_system_id: 254, agent_component_id: 191 }
+        Self {
+            url: None,
+            agent_system_id: 254,
+            agent_component_id: 191,
+        }
     }
 }
 
@@ -275,8 +279,10 @@ impl Mission {
     /// # Errors
     /// [`MissionError`] naming the file and every problem.
     pub fn load(path: &Path) -> Result<Self, MissionError> {
-        let text = std::fs::read_to_string(path)
-            .map_err(|source| MissionError::Read { path: path.to_owned(), source })?;
+        let text = std::fs::read_to_string(path).map_err(|source| MissionError::Read {
+            path: path.to_owned(),
+            source,
+        })?;
         let raw = parse(&text, path)?;
         build(raw, path)
     }
@@ -287,10 +293,15 @@ fn parse(text: &str, path: &Path) -> Result<RawMission, MissionError> {
         path: path.to_owned(),
         message: toml_problem(text, &error),
     };
-    let values = |problems| MissionError::Values { path: path.to_owned(), problems };
+    let values = |problems| MissionError::Values {
+        path: path.to_owned(),
+        problems,
+    };
     let table: toml::Table = toml::from_str(text).map_err(syntax)?;
-    let unknown: Vec<String> =
-        unknown_keys(&table, KNOWN).iter().map(KeyProblem::to_string).collect();
+    let unknown: Vec<String> = unknown_keys(&table, KNOWN)
+        .iter()
+        .map(KeyProblem::to_string)
+        .collect();
     let raw: RawMission = match toml::from_str(text) {
         Ok(raw) => raw,
         Err(_) if !unknown.is_empty() => return Err(values(unknown)),
@@ -298,35 +309,94 @@ fn parse(text: &str, path: &Path) -> Result<RawMission, MissionError> {
     };
     let mut problems = unknown;
     problems.extend(check(&raw));
-    if problems.is_empty() { Ok(raw) } else { Err(values(problems)) }
+    if problems.is_empty() {
+        Ok(raw)
+    } else {
+        Err(values(problems))
+    }
 }
 
 fn check(raw: &RawMission) -> Vec<String> {
     let mut checks = Checks::new();
     let name_is_fit = |name: &str| {
         (1..=32).contains(&name.len())
-            && name.chars().all(|c| c.is_ascii_alphanumeric() || c == '-' || c == '_')
+            && name
+                .chars()
+                .all(|c| c.is_ascii_alphanumeric() || c == '-' || c == '_')
     };
     for (key, name) in [("name", &raw.name), ("uav", &raw.uav)] {
         if !name_is_fit(name) {
-            checks.problem(format!("{key} is {name:?}, allowed are 1 to 32 letters, digits, - and _"));
+            checks.problem(format!(
+                "{key} is {name:?}, allowed are 1 to 32 letters, digits, - and _"
+            ));
         }
     }
-    checks.range("datum.latitude_deg", raw.datum.latitude_deg, -90.0, 90.0, "");
-    checks.range("datum.longitude_deg", raw.datum.longitude_deg, -180.0, 180.0, "");
-    checks.range("datum.height_ellipsoid_m", raw.datum.height_ellipsoid_m, -500.0, 9000.0, "");
+    checks.range(
+        "datum.latitude_deg",
+        raw.datum.latitude_deg,
+        -90.0,
+        90.0,
+        "",
+    );
+    checks.range(
+        "datum.longitude_deg",
+        raw.datum.longitude_deg,
+        -180.0,
+        180.0,
+        "",
+    );
+    checks.range(
+        "datum.height_ellipsoid_m",
+        raw.datum.height_ellipsoid_m,
+        -500.0,
+        9000.0,
+        "",
+    );
     check_numbers(&mut checks, raw);
     if let Some(terrain) = &raw.terrain {
         if terrain.kind != "plane" {
-            checks.problem(format!("terrain.kind is {:?}, allowed is \"plane\"", terrain.kind));
+            checks.problem(format!(
+                "terrain.kind is {:?}, allowed is \"plane\"",
+                terrain.kind
+            ));
         }
-        checks.range("terrain.height_ellipsoid_m", terrain.height_ellipsoid_m, -500.0, 9000.0, "");
-        checks.range("terrain.sigma_m", terrain.sigma_m, 0.05, 500.0, " (never perfectly flat)");
+        checks.range(
+            "terrain.height_ellipsoid_m",
+            terrain.height_ellipsoid_m,
+            -500.0,
+            9000.0,
+            "",
+        );
+        checks.range(
+            "terrain.sigma_m",
+            terrain.sigma_m,
+            0.05,
+            500.0,
+            " (never perfectly flat)",
+        );
     }
     check_sigma(&mut checks, &raw.sigma);
-    checks.range("track.confirm_sightings", f64::from(raw.track.confirm_sightings), 2.0, 100.0, "");
-    checks.range("track.confirm_span_s", raw.track.confirm_span_s, 0.0, 60.0, "");
-    checks.range("track.forget_suspected_s", raw.track.forget_suspected_s, 1.0, 3600.0, "");
+    checks.range(
+        "track.confirm_sightings",
+        f64::from(raw.track.confirm_sightings),
+        2.0,
+        100.0,
+        "",
+    );
+    checks.range(
+        "track.confirm_span_s",
+        raw.track.confirm_span_s,
+        0.0,
+        60.0,
+        "",
+    );
+    checks.range(
+        "track.forget_suspected_s",
+        raw.track.forget_suspected_s,
+        1.0,
+        3600.0,
+        "",
+    );
     checks.into_problems()
 }
 
@@ -334,7 +404,9 @@ fn check(raw: &RawMission) -> Vec<String> {
 fn check_numbers(checks: &mut Checks, raw: &RawMission) {
     let model = detector(&raw.model, &Path::to_owned).problems();
     let range = range(&raw.range).problems();
-    model.into_iter().for_each(|problem| checks.problem(format!("model.{problem}")));
+    model
+        .into_iter()
+        .for_each(|problem| checks.problem(format!("model.{problem}")));
     for problem in range {
         // The mission says what the number is for, the matcher what OpenCV calls it.
         let problem = problem.replace("num_disparities", "max_disparity_px");
@@ -343,19 +415,51 @@ fn check_numbers(checks: &mut Checks, raw: &RawMission) {
 }
 
 fn check_sigma(checks: &mut Checks, sigma: &RawSigma) {
-    checks.range("sigma.gnss_horizontal_m", sigma.gnss_horizontal_m, 0.005, 100.0, "");
-    checks.range("sigma.gnss_vertical_m", sigma.gnss_vertical_m, 0.005, 100.0, "");
+    checks.range(
+        "sigma.gnss_horizontal_m",
+        sigma.gnss_horizontal_m,
+        0.005,
+        100.0,
+        "",
+    );
+    checks.range(
+        "sigma.gnss_vertical_m",
+        sigma.gnss_vertical_m,
+        0.005,
+        100.0,
+        "",
+    );
     checks.range("sigma.gnss_floor_m", sigma.gnss_floor_m, 0.001, 100.0, "");
-    checks.range("sigma.heading_deg", sigma.heading_deg, 0.01, 180.0, " (degrees)");
+    checks.range(
+        "sigma.heading_deg",
+        sigma.heading_deg,
+        0.01,
+        180.0,
+        " (degrees)",
+    );
     checks.range("sigma.tilt_deg", sigma.tilt_deg, 0.01, 45.0, " (degrees)");
-    checks.range("sigma.gnss_correlation_s", sigma.gnss_correlation_s, 1.0, 1e6, "");
-    checks.range("sigma.heading_correlation_s", sigma.heading_correlation_s, 1.0, 1e6, "");
+    checks.range(
+        "sigma.gnss_correlation_s",
+        sigma.gnss_correlation_s,
+        1.0,
+        1e6,
+        "",
+    );
+    checks.range(
+        "sigma.heading_correlation_s",
+        sigma.heading_correlation_s,
+        1.0,
+        1e6,
+        "",
+    );
 }
 
 fn build(raw: RawMission, path: &Path) -> Result<Mission, MissionError> {
     let beside = |relative: &Path| path.parent().unwrap_or(Path::new(".")).join(relative);
-    let rig = Rig::load(&beside(&raw.rig))
-        .map_err(|source| MissionError::Rig { path: path.to_owned(), source })?;
+    let rig = Rig::load(&beside(&raw.rig)).map_err(|source| MissionError::Rig {
+        path: path.to_owned(),
+        source,
+    })?;
     let datum = place_from_degrees(
         raw.datum.latitude_deg,
         raw.datum.longitude_deg,
@@ -367,12 +471,16 @@ fn build(raw: RawMission, path: &Path) -> Result<Mission, MissionError> {
     })?;
     let terrain = raw.terrain.as_ref().map(|plane| -> Arc<dyn Terrain> {
         let height = EllipsoidHeight::from_m(plane.height_ellipsoid_m);
-        Arc::new(ConstantPlane { height, sigma_m: plane.sigma_m })
+        Arc::new(ConstantPlane {
+            height,
+            sigma_m: plane.sigma_m,
+        })
     });
-    let state_dir = raw.state.dir.as_deref().map_or_else(
-        || Path::new(".emberfix").join(&raw.name),
-        beside,
-    );
+    let state_dir = raw
+        .state
+        .dir
+        .as_deref()
+        .map_or_else(|| Path::new(".emberfix").join(&raw.name), beside);
     Ok(Mission {
         detector: detector(&raw.model, &beside),
         range: range(&raw.range),
@@ -416,9 +524,15 @@ fn detector(raw: &RawModel, beside: &dyn Fn(&Path) -> PathBuf) -> DetectorConfig
         sha256: raw.sha256.clone(),
         family: raw.family,
         threshold: raw.threshold,
-        tile_px: if raw.whole_frame_only { None } else { raw.tile_px.or(usual.tile_px) },
+        tile_px: if raw.whole_frame_only {
+            None
+        } else {
+            raw.tile_px.or(usual.tile_px)
+        },
         overlap_px: raw.overlap_px.unwrap_or(usual.overlap_px),
-        threads: raw.threads.map_or(usual.threads, |threads| threads as usize),
+        threads: raw
+            .threads
+            .map_or(usual.threads, |threads| threads as usize),
         ..usual
     }
 }
@@ -427,7 +541,9 @@ fn range(raw: &RawRange) -> SgbmConfig {
     let usual = SgbmConfig::default();
     SgbmConfig {
         num_disparities: raw.max_disparity_px.unwrap_or(usual.num_disparities),
-        max_sigma_over_range: raw.max_sigma_over_range.unwrap_or(usual.max_sigma_over_range),
+        max_sigma_over_range: raw
+            .max_sigma_over_range
+            .unwrap_or(usual.max_sigma_over_range),
         ..usual
     }
 }

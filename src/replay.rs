@@ -62,10 +62,18 @@ impl Replay {
     /// # Errors
     /// [`ReplayError::Source`] when it is no recording of this rig.
     pub fn open(path: &Path, mission: &Mission, pipeline: Pipeline) -> Result<Self, ReplayError> {
-        let recording = Recording::open(path, &mission.rig)
-            .map_err(|source| ReplayError::Source { path: path.to_owned(), source })?;
+        let recording =
+            Recording::open(path, &mission.rig).map_err(|source| ReplayError::Source {
+                path: path.to_owned(),
+                source,
+            })?;
         let mission_name = mission.name.clone();
-        Ok(Self { path: path.to_owned(), recording, mission_name, pipeline })
+        Ok(Self {
+            path: path.to_owned(),
+            recording,
+            mission_name,
+            pipeline,
+        })
     }
 
     /// Runs it through, writes `alarms.geojson`, `fixes.jsonl` and `summary.json` into `out`, and
@@ -78,10 +86,13 @@ impl Replay {
         let mut frames = FrameReader::new();
         let mut pairs = 0;
         loop {
-            let next = self.recording.next_event().map_err(|source| ReplayError::Source {
-                path: self.path.clone(),
-                source,
-            })?;
+            let next = self
+                .recording
+                .next_event()
+                .map_err(|source| ReplayError::Source {
+                    path: self.path.clone(),
+                    source,
+                })?;
             match next {
                 None => break,
                 Some(Recorded::Mavlink { arrived, bytes }) => {
@@ -100,7 +111,10 @@ impl Replay {
                 Some(Recorded::Calibration { .. }) => {}
             }
         }
-        let file_name = self.path.file_name().map(|name| name.to_string_lossy().into_owned());
+        let file_name = self
+            .path
+            .file_name()
+            .map(|name| name.to_string_lossy().into_owned());
         results.finish(json!({
             "mission": self.mission_name,
             "recording": file_name,
@@ -122,7 +136,10 @@ struct Results {
 
 impl Results {
     fn create(out: &Path) -> Result<Self, ReplayError> {
-        let write = |path: &Path, source| ReplayError::Write { path: path.to_owned(), source };
+        let write = |path: &Path, source| ReplayError::Write {
+            path: path.to_owned(),
+            source,
+        };
         std::fs::create_dir_all(out).map_err(|source| write(out, source))?;
         let path = out.join("fixes.jsonl");
         let file = std::fs::File::create(&path).map_err(|source| write(&path, source))?;
@@ -157,7 +174,10 @@ impl Results {
 
     fn finish(mut self, mut summary: Value) -> Result<Value, ReplayError> {
         let flushed = self.fixes.flush();
-        flushed.map_err(|source| ReplayError::Write { path: self.out.join("fixes.jsonl"), source })?;
+        flushed.map_err(|source| ReplayError::Write {
+            path: self.out.join("fixes.jsonl"),
+            source,
+        })?;
         let features: Vec<Value> = self.alarms.values().map(Alarm::to_geojson).collect();
         summary["fires"] = features.len().into();
         summary["alarm_revisions"] = self.revisions.into();
@@ -170,8 +190,10 @@ impl Results {
 }
 
 fn write_json(path: &Path, value: &Value) -> Result<(), ReplayError> {
-    std::fs::write(path, format!("{value:#}\n"))
-        .map_err(|source| ReplayError::Write { path: path.to_owned(), source })
+    std::fs::write(path, format!("{value:#}\n")).map_err(|source| ReplayError::Write {
+        path: path.to_owned(),
+        source,
+    })
 }
 
 /// A ground station's log through the real MAVLink reader: counts, rates, gaps and the track. It
@@ -180,11 +202,16 @@ fn write_json(path: &Path, value: &Value) -> Result<(), ReplayError> {
 /// # Errors
 /// [`ReplayError`].
 pub fn telemetry_log(path: &Path, out: &Path) -> Result<Value, ReplayError> {
-    let refuse = |problem: String| ReplayError::Telemetry { path: path.to_owned(), problem };
+    let refuse = |problem: String| ReplayError::Telemetry {
+        path: path.to_owned(),
+        problem,
+    };
     let bytes = std::fs::read(path).map_err(|error| refuse(error.to_string()))?;
     let summary = TlogSummary::of(&bytes);
     if summary.frames == 0 {
-        return Err(refuse("holds no MAVLink frame behind an 8-byte time stamp".to_owned()));
+        return Err(refuse(
+            "holds no MAVLink frame behind an 8-byte time stamp".to_owned(),
+        ));
     }
     let telemetry = serde_json::to_value(&summary).map_err(|error| refuse(error.to_string()))?;
     Results::create(out)?.finish(json!({

@@ -2,9 +2,7 @@
 
 use crate::pose::Pose;
 use emberfix_calib::Rig;
-use emberfix_frames::{
-    Attitude, EllipsoidHeight, ServiceTime, Vector3, Wgs84, place_from_degrees,
-};
+use emberfix_frames::{Attitude, EllipsoidHeight, ServiceTime, Vector3, Wgs84, place_from_degrees};
 use std::collections::BTreeSet;
 
 /// A rig without distortion, tilt or lever arm, so that vectors can be written by hand.
@@ -46,4 +44,3 @@ pub fn pose(roll: f64, pitch: f64, heading: f64) -> Pose {
         degraded: BTreeSet::new(),
     }
 }
-

@@ -28,7 +28,8 @@ fn rust_files(folder: &str) -> Vec<(PathBuf, String)> {
 
 /// Lines of code that hold a word, comments aside.
 fn lines_with<'a>(text: &'a str, word: &'a str) -> impl Iterator<Item = &'a str> {
-    text.lines().filter(move |line| !line.trim_start().starts_with("//") && line.contains(word))
+    text.lines()
+        .filter(move |line| !line.trim_start().starts_with("//") && line.contains(word))
 }
 
 fn assert_absent(folder: &str, words: &[&str]) {
@@ -38,15 +39,34 @@ fn assert_absent(folder: &str, words: &[&str]) {
         }
         for word in words {
             let found: Vec<_> = lines_with(&text, word).collect();
-            assert!(found.is_empty(), "{} must not use {word}: {found:?}", path.display());
+            assert!(
+                found.is_empty(),
+                "{} must not use {word}: {found:?}",
+                path.display()
+            );
         }
     }
 }
 
 #[test]
 fn the_core_reads_no_clock_and_does_no_io() {
-    let io = ["std::fs", "std::net", "std::time", "tokio", "std::thread", "rusqlite", "opencv::videoio"];
-    for room in ["src/locate", "src/track", "src/alarm", "src/assess", "src/pipeline", "frames/src"] {
+    let io = [
+        "std::fs",
+        "std::net",
+        "std::time",
+        "tokio",
+        "std::thread",
+        "rusqlite",
+        "opencv::videoio",
+    ];
+    for room in [
+        "src/locate",
+        "src/track",
+        "src/alarm",
+        "src/assess",
+        "src/pipeline",
+        "frames/src",
+    ] {
         assert_absent(room, &io);
     }
 }
@@ -59,7 +79,12 @@ fn only_detect_uses_onnx_runtime_and_only_range_matches_stereo() {
             assert_eq!(lines_with(&text, " ort::").count(), 0, "{}", path.display());
         }
         if !in_room("range") {
-            assert_eq!(lines_with(&text, "StereoSGBM").count(), 0, "{}", path.display());
+            assert_eq!(
+                lines_with(&text, "StereoSGBM").count(),
+                0,
+                "{}",
+                path.display()
+            );
         }
     }
 }
@@ -80,8 +105,22 @@ fn the_service_does_not_know_the_simulator_and_mav_does_not_know_fire() {
 
 #[test]
 fn the_domain_imports_no_adapter() {
-    let adapters = ["crate::deliver", "crate::record", "crate::ingest", "crate::ground", "crate::service"];
-    for room in ["src/locate", "src/track", "src/alarm", "src/assess", "src/pose", "src/detect", "src/range"] {
+    let adapters = [
+        "crate::deliver",
+        "crate::record",
+        "crate::ingest",
+        "crate::ground",
+        "crate::service",
+    ];
+    for room in [
+        "src/locate",
+        "src/track",
+        "src/alarm",
+        "src/assess",
+        "src/pose",
+        "src/detect",
+        "src/range",
+    ] {
         assert_absent(room, &adapters);
     }
 }

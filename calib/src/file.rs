@@ -116,8 +116,10 @@ const KNOWN: &[&str] = &[
 ];
 
 pub(crate) fn load(path: &Path) -> Result<Rig, RigError> {
-    let text = std::fs::read_to_string(path)
-        .map_err(|source| RigError::Read { path: path.to_owned(), source })?;
+    let text = std::fs::read_to_string(path).map_err(|source| RigError::Read {
+        path: path.to_owned(),
+        source,
+    })?;
     parse(&text, path)
 }
 
@@ -127,8 +129,10 @@ pub(crate) fn parse(text: &str, path: &Path) -> Result<Rig, RigError> {
         message: toml_problem(text, &error),
     };
     let table: toml::Table = toml::from_str(text).map_err(syntax)?;
-    let unknown: Vec<String> =
-        unknown_keys(&table, KNOWN).iter().map(KeyProblem::to_string).collect();
+    let unknown: Vec<String> = unknown_keys(&table, KNOWN)
+        .iter()
+        .map(KeyProblem::to_string)
+        .collect();
     let raw: RawRig = match toml::from_str(text) {
         Ok(raw) => raw,
         // A misspelt key is also a missing one: name the misspelling, it is what helps.
@@ -144,13 +148,19 @@ pub(crate) fn parse(text: &str, path: &Path) -> Result<Rig, RigError> {
 }
 
 fn values(path: &Path, problems: Vec<String>) -> RigError {
-    RigError::Values { path: path.to_owned(), problems }
+    RigError::Values {
+        path: path.to_owned(),
+        problems,
+    }
 }
 
 fn check(raw: &RawRig) -> Vec<String> {
     let mut checks = Checks::new();
     if raw.name.trim().is_empty() {
-        checks.problem(format!("name is {:?}, needed is a word for reports", raw.name));
+        checks.problem(format!(
+            "name is {:?}, needed is a word for reports",
+            raw.name
+        ));
     }
     check_camera(&mut checks, "left", &raw.left);
     check_camera(&mut checks, "right", &raw.right);
@@ -162,9 +172,21 @@ fn check(raw: &RawRig) -> Vec<String> {
     }
     check_stereo(&mut checks, &raw.stereo);
     check_mount(&mut checks, &raw.mount);
-    checks.range("time.camera_offset_s", raw.time.camera_offset_s, -2.0, 2.0, " (seconds)");
+    checks.range(
+        "time.camera_offset_s",
+        raw.time.camera_offset_s,
+        -2.0,
+        2.0,
+        " (seconds)",
+    );
     let sigma = &raw.sigma;
-    checks.range("sigma.disparity_bias_px", sigma.disparity_bias_px, 0.0, 20.0, "");
+    checks.range(
+        "sigma.disparity_bias_px",
+        sigma.disparity_bias_px,
+        0.0,
+        20.0,
+        "",
+    );
     checks.range("sigma.boresight_deg", sigma.boresight_deg, 0.0, 45.0, "");
     checks.range("sigma.lever_arm_m", sigma.lever_arm_m, 0.0, 5.0, "");
     checks.range("sigma.time_offset_s", sigma.time_offset_s, 0.0, 2.0, "");
@@ -176,11 +198,29 @@ fn check_camera(checks: &mut Checks, eye: &str, camera: &RawCamera) {
     checks.range(&format!("{eye}.image_size_px[0]"), width, 64.0, 8192.0, "");
     checks.range(&format!("{eye}.image_size_px[1]"), height, 64.0, 8192.0, "");
     for (axis, focal) in camera.focal_px.iter().enumerate() {
-        checks.range(&format!("{eye}.focal_px[{axis}]"), *focal, 0.1 * width, 20.0 * width, " (pixels, not mm)");
+        checks.range(
+            &format!("{eye}.focal_px[{axis}]"),
+            *focal,
+            0.1 * width,
+            20.0 * width,
+            " (pixels, not mm)",
+        );
     }
     let [cx, cy] = camera.principal_point_px;
-    checks.range(&format!("{eye}.principal_point_px[0]"), cx, 0.0, width - 1.0, "");
-    checks.range(&format!("{eye}.principal_point_px[1]"), cy, 0.0, height - 1.0, "");
+    checks.range(
+        &format!("{eye}.principal_point_px[0]"),
+        cx,
+        0.0,
+        width - 1.0,
+        "",
+    );
+    checks.range(
+        &format!("{eye}.principal_point_px[1]"),
+        cy,
+        0.0,
+        height - 1.0,
+        "",
+    );
     if camera.distortion.len() != 5 {
         checks.problem(format!(
             "{eye}.distortion has {} terms, needed are 5 (k1, k2, p1, p2, k3)",
@@ -188,7 +228,13 @@ fn check_camera(checks: &mut Checks, eye: &str, camera: &RawCamera) {
         ));
     }
     for (term, value) in camera.distortion.iter().enumerate() {
-        checks.range(&format!("{eye}.distortion[{term}]"), *value, -10.0, 10.0, "");
+        checks.range(
+            &format!("{eye}.distortion[{term}]"),
+            *value,
+            -10.0,
+            10.0,
+            "",
+        );
     }
 }
 
@@ -198,7 +244,13 @@ fn check_stereo(checks: &mut Checks, stereo: &RawStereo) {
         checks.range(&key, *angle, -30.0, 30.0, " (degrees)");
     }
     let [x, y, z] = stereo.right_from_left_translation_m;
-    checks.range("stereo.max_skew_s", stereo.max_skew_s, 0.0, 0.1, " (seconds)");
+    checks.range(
+        "stereo.max_skew_s",
+        stereo.max_skew_s,
+        0.0,
+        0.1,
+        " (seconds)",
+    );
     if x > 0.0 {
         checks.problem(format!(
             "stereo.right_from_left_translation_m[0] is {x}, allowed is below 0: the eyes are \
@@ -208,27 +260,55 @@ fn check_stereo(checks: &mut Checks, stereo: &RawStereo) {
     }
     let baseline = Vector3::new(x, y, z).norm();
     let baseline_hint = " (the baseline in metres, not mm)";
-    checks.range("stereo.right_from_left_translation_m", baseline, 0.005, 5.0, baseline_hint);
-    checks.range("stereo.right_from_left_translation_m[1]", y, x, -x, " (eyes one above the other)");
+    checks.range(
+        "stereo.right_from_left_translation_m",
+        baseline,
+        0.005,
+        5.0,
+        baseline_hint,
+    );
+    checks.range(
+        "stereo.right_from_left_translation_m[1]",
+        y,
+        x,
+        -x,
+        " (eyes one above the other)",
+    );
 }
 
 fn check_mount(checks: &mut Checks, mount: &RawMount) {
     checks.range("mount.yaw_deg", mount.yaw_deg, -180.0, 180.0, "");
-    checks.range("mount.depression_deg", mount.depression_deg, -90.0, 90.0, " (positive below the nose)");
+    checks.range(
+        "mount.depression_deg",
+        mount.depression_deg,
+        -90.0,
+        90.0,
+        " (positive below the nose)",
+    );
     checks.range("mount.roll_deg", mount.roll_deg, -180.0, 180.0, "");
     for (axis, arm) in mount.lever_arm_m.iter().enumerate() {
-        checks.range(&format!("mount.lever_arm_m[{axis}]"), *arm, -20.0, 20.0, " (metres)");
+        checks.range(
+            &format!("mount.lever_arm_m[{axis}]"),
+            *arm,
+            -20.0,
+            20.0,
+            " (metres)",
+        );
     }
 }
 
 fn build(raw: RawRig, path: &Path) -> Result<Rig, RigError> {
     let (left, right) = (camera(&raw.left), camera(&raw.right));
     let turn = Vector3::from(raw.stereo.right_from_left_rotation_deg).map(f64::to_radians);
-    let right_from_left =
-        emberfix_frames::UnitQuaternion::from_scaled_axis(turn).to_rotation_matrix().into_inner();
+    let right_from_left = emberfix_frames::UnitQuaternion::from_scaled_axis(turn)
+        .to_rotation_matrix()
+        .into_inner();
     let translation_m = Vector3::from(raw.stereo.right_from_left_translation_m);
     let rectification = Rectification::new(&left, &right, &right_from_left, &translation_m)
-        .map_err(|source| RigError::Rectify { path: path.to_owned(), source })?;
+        .map_err(|source| RigError::Rectify {
+            path: path.to_owned(),
+            source,
+        })?;
     let turned_deg = rectification.turn_rad(Eye::Left).to_degrees();
     if turned_deg > MAX_TURN_DEG {
         let problem = format!(

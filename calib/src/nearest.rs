@@ -86,7 +86,9 @@ impl Checks {
     /// Refuses a value outside `low..=high`; `hint` is added to the sentence (unit, usual mistake).
     pub fn range(&mut self, key: &str, value: f64, low: f64, high: f64, hint: &str) {
         if !(low..=high).contains(&value) {
-            self.problems.push(format!("{key} is {value}, allowed is {low} to {high}{hint}"));
+            self.problems.push(format!(
+                "{key} is {value}, allowed is {low} to {high}{hint}"
+            ));
         }
     }
 

@@ -50,16 +50,23 @@ impl Attitude {
             return Err(AttitudeError::NotFinite { w, x, y, z });
         }
         if (norm - 1.0).abs() > NORM_TOLERANCE {
-            return Err(AttitudeError::NotUnit { norm, tolerance: NORM_TOLERANCE });
+            return Err(AttitudeError::NotUnit {
+                norm,
+                tolerance: NORM_TOLERANCE,
+            });
         }
-        Ok(Self { ned_from_body: UnitQuaternion::new_normalize(quaternion) })
+        Ok(Self {
+            ned_from_body: UnitQuaternion::new_normalize(quaternion),
+        })
     }
 
     /// From aeronautical angles in radians: heading from true north clockwise, pitch nose up, roll
     /// right wing down; applied in that order.
     #[must_use]
     pub fn from_angles(roll_rad: f64, pitch_rad: f64, heading_rad: f64) -> Self {
-        Self { ned_from_body: UnitQuaternion::from_euler_angles(roll_rad, pitch_rad, heading_rad) }
+        Self {
+            ned_from_body: UnitQuaternion::from_euler_angles(roll_rad, pitch_rad, heading_rad),
+        }
     }
 
     /// Roll, pitch, heading in radians.
@@ -77,15 +84,21 @@ impl Attitude {
     /// Between `self` (share 0) and `later` (share 1), along the shortest arc.
     #[must_use]
     pub fn slerp(&self, later: &Self, share: f64) -> Self {
-        let between = self.ned_from_body.try_slerp(&later.ned_from_body, share, 1e-9);
-        Self { ned_from_body: between.unwrap_or(later.ned_from_body) }
+        let between = self
+            .ned_from_body
+            .try_slerp(&later.ned_from_body, share, 1e-9);
+        Self {
+            ned_from_body: between.unwrap_or(later.ned_from_body),
+        }
     }
 
     /// Turned on by `rate_rad_s` (about body axes) for `dt_s`.
     #[must_use]
     pub fn rotated(&self, rate_rad_s: Vector3<f64>, dt_s: f64) -> Self {
         let turn = UnitQuaternion::from_scaled_axis(rate_rad_s * dt_s);
-        Self { ned_from_body: self.ned_from_body * turn }
+        Self {
+            ned_from_body: self.ned_from_body * turn,
+        }
     }
 
     /// Angle between two attitudes in radians.
@@ -139,7 +152,10 @@ mod tests {
         assert!((attitude.angles().2 - FRAC_PI_2).abs() < 1e-12);
         let nose = Vector::<BodyFrd>::from_metres(Vector3::x());
         let ned = attitude.ned_from_body().transform(nose).metres();
-        assert!((ned - Vector3::y()).norm() < 1e-12, "north, east, down: {ned}");
+        assert!(
+            (ned - Vector3::y()).norm() < 1e-12,
+            "north, east, down: {ned}"
+        );
     }
 
     #[test]
@@ -149,14 +165,19 @@ mod tests {
         let banked = Attitude::from_angles(FRAC_PI_2, 0.0, 0.0);
         let wing = Vector::<BodyFrd>::from_metres(Vector3::y());
         let wing_enu = banked.enu_from_body().transform(wing).metres();
-        assert!((wing_enu + Vector3::z()).norm() < 1e-12, "right wing in ENU: {wing_enu}");
+        assert!(
+            (wing_enu + Vector3::z()).norm() < 1e-12,
+            "right wing in ENU: {wing_enu}"
+        );
     }
 
     #[test]
     fn matrices_take_from_components_to_to_components() {
         let rotation = Attitude::from_angles(0.1, -0.2, 2.0).enu_from_body();
         let body = Vector3::new(1.0, -2.0, 3.0);
-        let typed = rotation.transform(Vector::<BodyFrd>::from_metres(body)).metres();
+        let typed = rotation
+            .transform(Vector::<BodyFrd>::from_metres(body))
+            .metres();
         assert!((crate::rotation_matrix(&rotation) * body - typed).norm() < 1e-12);
     }
 

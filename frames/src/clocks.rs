@@ -138,6 +138,9 @@ mod tests {
     #[test]
     fn a_fraction_of_a_second_keeps_its_sign() {
         assert_eq!(seconds(-0.25).as_nanos(), -250_000_000);
-        assert_eq!(BootTime::from_ms(1) + seconds(-0.0005), BootTime::from_us(500));
+        assert_eq!(
+            BootTime::from_ms(1) + seconds(-0.0005),
+            BootTime::from_us(500)
+        );
     }
 }

@@ -74,7 +74,10 @@ impl<In> Covariance<In> {
         if variance < -limit {
             return Err(CovarianceError::Negative { variance });
         }
-        Ok(Self { m2: symmetric, frame: PhantomData })
+        Ok(Self {
+            m2: symmetric,
+            frame: PhantomData,
+        })
     }
 
     /// The covariance `J S J'`, which is one by construction.
@@ -87,20 +90,29 @@ impl<In> Covariance<In> {
         sigmas: &nalgebra::SVector<f64, N>,
     ) -> Self {
         let scaled = jacobian * nalgebra::SMatrix::<f64, N, N>::from_diagonal(sigmas);
-        Self { m2: scaled * scaled.transpose(), frame: PhantomData }
+        Self {
+            m2: scaled * scaled.transpose(),
+            frame: PhantomData,
+        }
     }
 
     /// No error at all.
     #[must_use]
     pub fn zero() -> Self {
-        Self { m2: Matrix3::zeros(), frame: PhantomData }
+        Self {
+            m2: Matrix3::zeros(),
+            frame: PhantomData,
+        }
     }
 
     /// Independent errors along the axes, from their sigmas in metres.
     #[must_use]
     pub fn from_sigmas_m(x: f64, y: f64, z: f64) -> Self {
         let variances = nalgebra::Vector3::new(x * x, y * y, z * z);
-        Self { m2: Matrix3::from_diagonal(&variances), frame: PhantomData }
+        Self {
+            m2: Matrix3::from_diagonal(&variances),
+            frame: PhantomData,
+        }
     }
 
     /// The matrix in m².
@@ -121,14 +133,20 @@ impl<In> Covariance<In> {
     pub fn rotated<To>(&self, rotation: &Rotation<In, To>) -> Covariance<To> {
         let r = crate::rotation_matrix(rotation);
         let turned = r * self.m2 * r.transpose();
-        Covariance { m2: (turned + turned.transpose()) * 0.5, frame: PhantomData }
+        Covariance {
+            m2: (turned + turned.transpose()) * 0.5,
+            frame: PhantomData,
+        }
     }
 
     /// The same matrix in another frame whose axes are parallel to this one's to within what the
     /// caller may neglect (two tangent planes a flight apart: 1e-4 rad in 600 m).
     #[must_use]
     pub fn in_parallel_axes<To>(&self) -> Covariance<To> {
-        Covariance { m2: self.m2, frame: PhantomData }
+        Covariance {
+            m2: self.m2,
+            frame: PhantomData,
+        }
     }
 
     /// Larger, smaller standard deviation of the first two axes in metres, and the direction of
@@ -138,7 +156,11 @@ impl<In> Covariance<In> {
         let (a, b, c) = (self.m2[(0, 0)], self.m2[(0, 1)], self.m2[(1, 1)]);
         let (mean, half) = ((a + c) / 2.0, ((a - c) / 2.0).hypot(b));
         let direction = 0.5 * (2.0 * b).atan2(a - c);
-        ((mean + half).max(0.0).sqrt(), (mean - half).max(0.0).sqrt(), direction)
+        (
+            (mean + half).max(0.0).sqrt(),
+            (mean - half).max(0.0).sqrt(),
+            direction,
+        )
     }
 
     /// Radius in metres of the horizontal circle that holds 90 %, exactly (no fitted factor).
@@ -163,7 +185,11 @@ impl<In> Covariance<In> {
         let (mut low, mut high) = (1.6 * a, 2.2 * a);
         for _ in 0..40 {
             let middle = 0.5 * (low + high);
-            if share(middle) < NINETY { low = middle } else { high = middle }
+            if share(middle) < NINETY {
+                low = middle
+            } else {
+                high = middle
+            }
         }
         0.5 * (low + high)
     }
@@ -194,7 +220,10 @@ impl<In> Add for Covariance<In> {
     type Output = Self;
     /// The covariance of the sum of two independent errors.
     fn add(self, other: Self) -> Self {
-        Self { m2: self.m2 + other.m2, frame: PhantomData }
+        Self {
+            m2: self.m2 + other.m2,
+            frame: PhantomData,
+        }
     }
 }
 
@@ -218,9 +247,15 @@ mod tests {
     #[test]
     fn asymmetric_negative_and_nan_are_refused() {
         let asymmetric = Matrix3::new(1.0, 0.5, 0.0, 0.4, 1.0, 0.0, 0.0, 0.0, 1.0);
-        assert!(matches!(Enu::new(asymmetric), Err(CovarianceError::Asymmetric { .. })));
+        assert!(matches!(
+            Enu::new(asymmetric),
+            Err(CovarianceError::Asymmetric { .. })
+        ));
         let negative = Matrix3::from_diagonal(&nalgebra::Vector3::new(1.0, -0.1, 1.0));
-        assert!(matches!(Enu::new(negative), Err(CovarianceError::Negative { .. })));
+        assert!(matches!(
+            Enu::new(negative),
+            Err(CovarianceError::Negative { .. })
+        ));
         assert!(matches!(
             Enu::new(Matrix3::from_element(f64::NAN)),
             Err(CovarianceError::NotFinite)

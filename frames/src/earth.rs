@@ -96,7 +96,9 @@ impl Wgs84Parts for Wgs84 {
         EllipsoidHeight::from_m(self.altitude().get::<meter>())
     }
     fn at_height(&self, height: EllipsoidHeight) -> Self {
-        self.to_builder().altitude(Length::new::<meter>(height.m())).build()
+        self.to_builder()
+            .altitude(Length::new::<meter>(height.m()))
+            .build()
     }
 }
 
@@ -108,7 +110,10 @@ pub fn enu_from_ecef<Enu>(origin: &Wgs84) -> RigidBodyTransform<Ecef, Enu>
 where
     Enu: CoordinateSystem<Convention = EnuLike>,
 {
-    #[expect(unsafe_code, reason = "the plane of `Enu` is DEFINED as the one at `origin`")]
+    #[expect(
+        unsafe_code,
+        reason = "the plane of `Enu` is DEFINED as the one at `origin`"
+    )]
     // SAFETY: both tangent-plane systems of this crate take their origin from the value that the
     // caller holds for that plane; there is no other definition for it to disagree with.
     unsafe {
@@ -138,5 +143,7 @@ pub fn enu_offset(origin: &Wgs84, place: &Wgs84) -> Vector3<f64> {
 #[must_use]
 pub fn rotation_matrix<From, To>(rotation: &Rotation<From, To>) -> Matrix3<f64> {
     let (w, i, j, k) = rotation.to_quaternion();
-    UnitQuaternion::new_normalize(Quaternion::new(w, i, j, k)).to_rotation_matrix().into_inner()
+    UnitQuaternion::new_normalize(Quaternion::new(w, i, j, k))
+        .to_rotation_matrix()
+        .into_inner()
 }

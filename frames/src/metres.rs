@@ -16,7 +16,10 @@ pub trait Metres: Sized {
 macro_rules! typed {
     ($type:ty, $metres:expr) => {{
         let [x, y, z] = <[f64; 3]>::from($metres).map(Length::new::<meter>);
-        #[expect(deprecated, reason = "generic over the frame: no builder serves all conventions")]
+        #[expect(
+            deprecated,
+            reason = "generic over the frame: no builder serves all conventions"
+        )]
         let value = <$type>::from_cartesian(x, y, z);
         value
     }};

@@ -27,8 +27,7 @@ where
     Cam: CoordinateSystem<Convention = RightHandedXyzLike>,
 {
     // Aeronautical pitch is nose up, depression is boresight down.
-    let turned =
-        Rotation3::from_euler_angles(mount.roll_rad, -mount.depression_rad, mount.yaw_rad);
+    let turned = Rotation3::from_euler_angles(mount.roll_rad, -mount.depression_rad, mount.yaw_rad);
     #[rustfmt::skip]
     let aligned = Matrix3::new(
         0.0, 0.0, 1.0, // forward is the boresight
@@ -47,7 +46,10 @@ pub fn raw_from_rectified(rectified_from_raw: &Matrix3<f64>) -> Rotation<CamLeft
 
 fn from_matrix<From, To>(to_from: &Matrix3<f64>) -> Rotation<From, To> {
     let q = UnitQuaternion::from_matrix(to_from).into_inner();
-    #[expect(unsafe_code, reason = "the one place that states the camera's relations")]
+    #[expect(
+        unsafe_code,
+        reason = "the one place that states the camera's relations"
+    )]
     // SAFETY: private; both callers build the matrix that takes `From` components to `To`
     // components, from the definition of the two frames (the mount angles, OpenCV's R1).
     unsafe {
@@ -64,20 +66,31 @@ mod tests {
 
     fn boresight(mount: MountAngles) -> Vector3<f64> {
         let ten_metres = Vector::<CamLeft>::from_metres(Vector3::new(0.0, 0.0, 10.0));
-        body_from_camera::<CamLeft>(mount).transform(ten_metres).metres()
+        body_from_camera::<CamLeft>(mount)
+            .transform(ten_metres)
+            .metres()
     }
 
     /// Checklist item 48: level, heading north, 30 degrees down, 10 m on the axis.
     #[test]
     fn thirty_degrees_down_at_ten_metres_is_the_papers_vector() {
-        let mount = MountAngles { depression_rad: 30_f64.to_radians(), ..Default::default() };
+        let mount = MountAngles {
+            depression_rad: 30_f64.to_radians(),
+            ..Default::default()
+        };
         let body = boresight(mount);
-        assert!((body - Vector3::new(8.660_254, 0.0, 5.0)).norm() < 1e-6, "{body}");
+        assert!(
+            (body - Vector3::new(8.660_254, 0.0, 5.0)).norm() < 1e-6,
+            "{body}"
+        );
         let enu = Attitude::from_angles(0.0, 0.0, 0.0)
             .enu_from_body()
             .transform(Vector::<BodyFrd>::from_metres(body))
             .metres();
-        assert!((enu - Vector3::new(0.0, 8.660_254, -5.0)).norm() < 1e-6, "{enu}");
+        assert!(
+            (enu - Vector3::new(0.0, 8.660_254, -5.0)).norm() < 1e-6,
+            "{enu}"
+        );
     }
 
     #[test]
@@ -87,13 +100,22 @@ mod tests {
             body_from_camera::<CamLeft>(mount).transform(y).metres()
         };
         // Straight down: the lower image edge looks aft.
-        let nadir = MountAngles { depression_rad: 90_f64.to_radians(), ..Default::default() };
+        let nadir = MountAngles {
+            depression_rad: 90_f64.to_radians(),
+            ..Default::default()
+        };
         assert!((image_down(nadir) + Vector3::x()).norm() < 1e-12);
         assert!((boresight(nadir) - Vector3::new(0.0, 0.0, 10.0)).norm() < 1e-9);
         // Yaw to the right wing; clockwise roll puts the lower edge to the left.
-        let right = MountAngles { yaw_rad: 90_f64.to_radians(), ..Default::default() };
+        let right = MountAngles {
+            yaw_rad: 90_f64.to_radians(),
+            ..Default::default()
+        };
         assert!((boresight(right) - Vector3::new(0.0, 10.0, 0.0)).norm() < 1e-9);
-        let rolled = MountAngles { roll_rad: 90_f64.to_radians(), ..Default::default() };
+        let rolled = MountAngles {
+            roll_rad: 90_f64.to_radians(),
+            ..Default::default()
+        };
         assert!((image_down(rolled) + Vector3::y()).norm() < 1e-12);
     }
 }

@@ -63,7 +63,10 @@ impl TimeSync {
 
     /// Takes one exchange in. False when it was refused (negative or overlong round trip).
     pub fn add(&mut self, sample: TimeSyncSample) -> bool {
-        let round_trip_ns = sample.answered.unix_ns().saturating_sub(sample.asked.unix_ns());
+        let round_trip_ns = sample
+            .answered
+            .unix_ns()
+            .saturating_sub(sample.asked.unix_ns());
         if !(0..=MAX_ROUND_TRIP_NS).contains(&round_trip_ns) {
             self.refused += 1;
             return false;
@@ -74,7 +77,13 @@ impl TimeSync {
         if self.exchanges.back().is_some_and(jumped) {
             self.restart();
         }
-        push_bounded(&mut self.exchanges, Exchange { offset_ns, round_trip_ns });
+        push_bounded(
+            &mut self.exchanges,
+            Exchange {
+                offset_ns,
+                round_trip_ns,
+            },
+        );
         true
     }
 
@@ -98,7 +107,9 @@ impl TimeSync {
     #[must_use]
     pub fn offset(&self) -> Option<SignedDuration> {
         let quickest = self.quickest().map(|exchange| exchange.offset_ns);
-        quickest.or_else(|| self.arrivals.iter().min().copied()).map(SignedDuration::from_nanos)
+        quickest
+            .or_else(|| self.arrivals.iter().min().copied())
+            .map(SignedDuration::from_nanos)
     }
 
     /// One sigma of the offset in seconds: a third of the bound (half the quickest round trip), or
@@ -144,7 +155,9 @@ impl TimeSync {
     }
 
     fn quickest(&self) -> Option<&Exchange> {
-        self.exchanges.iter().min_by_key(|exchange| exchange.round_trip_ns)
+        self.exchanges
+            .iter()
+            .min_by_key(|exchange| exchange.round_trip_ns)
     }
 }
 
@@ -173,7 +186,11 @@ mod tests {
     fn the_quickest_exchange_wins_over_asymmetric_ones() {
         let mut sync = TimeSync::new();
         for i in 0..20 {
-            assert!(sync.add(exchange(2_000_000 + 100 * i, 2, if i == 7 { 2 } else { 40 })));
+            assert!(sync.add(exchange(
+                2_000_000 + 100 * i,
+                2,
+                if i == 7 { 2 } else { 40 }
+            )));
         }
         assert_eq!(sync.offset(), Some(SignedDuration::from_millis(1_000_000)));
         assert_eq!(sync.quality(), SyncQuality::Converged);

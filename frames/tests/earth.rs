@@ -70,7 +70,12 @@ proptest! {
 #[test]
 fn impossible_places_are_refused_with_their_value() {
     let height = EllipsoidHeight::from_m(0.0);
-    for (latitude, longitude) in [(90.1, 0.0), (f64::NAN, 0.0), (0.0, f64::INFINITY), (0.0, 400.0)] {
+    for (latitude, longitude) in [
+        (90.1, 0.0),
+        (f64::NAN, 0.0),
+        (0.0, f64::INFINITY),
+        (0.0, 400.0),
+    ] {
         assert!(place_from_degrees(latitude, longitude, height).is_err());
     }
     assert!(place_from_degrees(0.0, 0.0, EllipsoidHeight::from_m(1e7)).is_err());

@@ -1,6 +1,10 @@
 //! Conversions against published vectors (`tests/data/geo`, sources in the rows themselves).
 
-#![expect(clippy::unwrap_used, clippy::panic, reason = "a test may stop at its first surprise")]
+#![expect(
+    clippy::unwrap_used,
+    clippy::panic,
+    reason = "a test may stop at its first surprise"
+)]
 
 use emberfix_frames::{
     Coordinate, Ecef, EllipsoidHeight, Geoid, Metres, MissionEnu, Vector, Vector3, Wgs84,
@@ -17,7 +21,10 @@ struct Row {
 }
 
 fn rows() -> Vec<Row> {
-    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/data/geo/golden_vectors.csv");
+    let path = concat!(
+        env!("CARGO_MANIFEST_DIR"),
+        "/../tests/data/geo/golden_vectors.csv"
+    );
     let text = std::fs::read_to_string(path).unwrap();
     text.lines().skip(1).map(row).collect()
 }
@@ -66,7 +73,13 @@ fn difference_m(row: &Row) -> f64 {
         "ecef_to_lla" => match place_from_ecef(&ecef(row.input)) {
             Some(found) => lla_difference_m(&found, row.output),
             // Deep in the Earth: refused, not converted.
-            None => if row.output.z < -5e6 { 0.0 } else { f64::INFINITY },
+            None => {
+                if row.output.z < -5e6 {
+                    0.0
+                } else {
+                    f64::INFINITY
+                }
+            }
         },
         "lla_to_enu" => {
             let here = Coordinate::<Ecef>::from_wgs84(&place(row.input));
@@ -109,18 +122,30 @@ fn every_golden_vector_holds_within_its_tolerance() {
     for row in &rows {
         let difference = difference_m(row);
         let limit = row.tolerance_m + GRS80_M;
-        assert!(difference <= limit, "{} {}: {difference:.3e} m > {limit:.3e} m", row.id, row.op);
+        assert!(
+            difference <= limit,
+            "{} {}: {difference:.3e} m > {limit:.3e} m",
+            row.id,
+            row.op
+        );
     }
 }
 
 #[test]
 fn egm96_agrees_with_the_published_undulations() {
-    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/data/geo/egm96_nga_points.csv");
+    let path = concat!(
+        env!("CARGO_MANIFEST_DIR"),
+        "/../tests/data/geo/egm96_nga_points.csv"
+    );
     let text = std::fs::read_to_string(path).unwrap();
     let mut geoid = Geoid::new();
     let mut checked = 0;
     for line in text.lines().filter(|line| !line.starts_with('#')).skip(1) {
-        let fields: Vec<f64> = line.split(',').take(3).map(|field| field.parse().unwrap()).collect();
+        let fields: Vec<f64> = line
+            .split(',')
+            .take(3)
+            .map(|field| field.parse().unwrap())
+            .collect();
         let found = geoid.undulation(fields[0], fields[1]).m();
         // NGA prints to 1 mm; GeoidEval's grid is interpolated to some centimetres; ours is linear
         // over 2.2 km. Mean sea level for ellipsoid height would be off by up to 100 m.

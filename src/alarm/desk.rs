@@ -3,8 +3,7 @@
 use super::{Alarm, AlarmProperties, FireId, FireState};
 use crate::track::Fire;
 use emberfix_frames::{
-    Covariance, HeightAboveGround, MissionEnu, MslAltitude, ServiceTime, Wgs84,
-    enu_offset,
+    Covariance, HeightAboveGround, MissionEnu, MslAltitude, ServiceTime, Wgs84, enu_offset,
 };
 use std::collections::BTreeMap;
 
@@ -55,7 +54,10 @@ impl AlarmDesk {
     /// Nothing told yet; `uav` names the aircraft in every alarm.
     #[must_use]
     pub fn new(uav: String) -> Self {
-        Self { uav, told: BTreeMap::new() }
+        Self {
+            uav,
+            told: BTreeMap::new(),
+        }
     }
 
     /// The alarms that are due. `situate` places a fire on the Earth; one that is nowhere on it is
@@ -90,7 +92,11 @@ impl AlarmDesk {
 
     /// A sighting's Feature with the aircraft's name and the fire's id.
     #[must_use]
-    pub fn signed(&self, fire: Option<FireId>, mut feature: serde_json::Value) -> serde_json::Value {
+    pub fn signed(
+        &self,
+        fire: Option<FireId>,
+        mut feature: serde_json::Value,
+    ) -> serde_json::Value {
         feature["properties"]["uav"] = self.uav.clone().into();
         feature["properties"]["fire"] = fire.map(|fire| self.id(fire)).into();
         feature
@@ -110,8 +116,7 @@ impl AlarmDesk {
         }
         let since_s = (fire.last_seen - told.captured_at).as_secs_f64();
         let moved_m = enu_offset(&told.place, &situation.place).xy().norm();
-        let changed =
-            moved_m > MOVED * told.ce90_m || covariance.ce90_m() < BETTER * told.ce90_m;
+        let changed = moved_m > MOVED * told.ce90_m || covariance.ce90_m() < BETTER * told.ce90_m;
         since_s >= REPEAT_S || (changed && since_s >= LEAST_S)
     }
 
@@ -126,7 +131,13 @@ impl AlarmDesk {
         let place = situation.place;
         self.told.insert(
             fire.id,
-            Told { revision, state: fire.state, place, ce90_m, captured_at: fire.last_seen },
+            Told {
+                revision,
+                state: fire.state,
+                place,
+                ce90_m,
+                captured_at: fire.last_seen,
+            },
         );
         Alarm {
             place,

@@ -192,16 +192,17 @@ impl Alarm {
         check_kind(&feature.kind, "Feature")?;
         check_kind(&feature.geometry.kind, "Point")?;
         check_properties(&feature.properties)?;
-        Ok(Self { place, properties: feature.properties })
+        Ok(Self {
+            place,
+            properties: feature.properties,
+        })
     }
 
     /// Position covariance, in a plane parallel to the one at the position.
     ///
     /// # Errors
     /// When the carried matrix is no covariance.
-    pub fn covariance(
-        &self,
-    ) -> Result<Covariance<MissionEnu>, emberfix_frames::CovarianceError> {
+    pub fn covariance(&self) -> Result<Covariance<MissionEnu>, emberfix_frames::CovarianceError> {
         let m2 = emberfix_frames::Matrix3::from_row_slice(&self.properties.covariance_enu_m2);
         Covariance::new(m2)
     }
@@ -211,11 +212,19 @@ fn check_kind(kind: &str, allowed: &'static str) -> Result<(), AlarmError> {
     if kind == allowed {
         return Ok(());
     }
-    Err(AlarmError::Value { name: "type", value: kind.to_owned(), allowed })
+    Err(AlarmError::Value {
+        name: "type",
+        value: kind.to_owned(),
+        allowed,
+    })
 }
 
 fn check_properties(properties: &AlarmProperties) -> Result<(), AlarmError> {
-    let value = |name, value: f64, allowed| AlarmError::Value { name, value: value.to_string(), allowed };
+    let value = |name, value: f64, allowed| AlarmError::Value {
+        name,
+        value: value.to_string(),
+        allowed,
+    };
     if !(0.0..=1.0).contains(&properties.confidence) {
         return Err(value("confidence", properties.confidence, "0 to 1"));
     }
@@ -239,7 +248,9 @@ mod rfc3339 {
     pub fn serialize<S: Serializer>(at: &ServiceTime, serializer: S) -> Result<S::Ok, S::Error> {
         serializer.serialize_str(&at.rfc3339())
     }
-    pub fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<ServiceTime, D::Error> {
+    pub fn deserialize<'de, D: Deserializer<'de>>(
+        deserializer: D,
+    ) -> Result<ServiceTime, D::Error> {
         let text = String::deserialize(deserializer)?;
         ServiceTime::from_rfc3339(&text)
             .ok_or_else(|| D::Error::custom(format!("{text:?} is no RFC 3339 time")))

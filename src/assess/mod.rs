@@ -88,10 +88,14 @@ impl Flicker {
     #[must_use]
     pub fn may_be_lamp(&self, size: Option<SizeM>, sightings: u32) -> bool {
         let small = size.is_some_and(|size| size.width.max(size.height) < SMALL_LIGHT_M);
-        let steady =
-            f64::from(self.small_changes) >= STEADY_SHARE * f64::from(self.changes);
+        let steady = f64::from(self.small_changes) >= STEADY_SHARE * f64::from(self.changes);
         let unjudged = self.changes < FLICKER_LOOKS;
-        small && if unjudged { sightings < ENOUGH_SIGHTINGS } else { steady }
+        small
+            && if unjudged {
+                sightings < ENOUGH_SIGHTINGS
+            } else {
+                steady
+            }
     }
 }
 
@@ -112,13 +116,25 @@ mod tests {
 
     #[test]
     fn a_lamp_is_steady_while_we_come_nearer_and_a_flame_is_not() {
-        let small = Some(SizeM { width: 0.6, height: 0.8 });
-        let large = Some(SizeM { width: 6.0, height: 4.0 });
+        let small = Some(SizeM {
+            width: 0.6,
+            height: 0.8,
+        });
+        let large = Some(SizeM {
+            width: 6.0,
+            height: 4.0,
+        });
         let lamp = watch(|look| 5000.0 * (1.0 + 0.01 * (look % 2) as f64));
         let flame = watch(|look| 5000.0 * (1.0 + 0.3 * (look % 3) as f64));
         assert!(lamp.may_be_lamp(small, 8) && !flame.may_be_lamp(small, 8));
-        assert!(!lamp.may_be_lamp(large, 8), "large fires flicker little as a whole");
+        assert!(
+            !lamp.may_be_lamp(large, 8),
+            "large fires flicker little as a whole"
+        );
         assert!(Flicker::default().may_be_lamp(small, 4), "not judged yet");
-        assert!(!Flicker::default().may_be_lamp(small, 12), "never judged: a flame");
+        assert!(
+            !Flicker::default().may_be_lamp(small, 12),
+            "never judged: a flame"
+        );
     }
 }

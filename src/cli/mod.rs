@@ -119,7 +119,10 @@ pub(crate) fn detector(
 
 /// A runtime for the commands that talk.
 pub(crate) fn runtime() -> Result<tokio::runtime::Runtime, Failure> {
-    tokio::runtime::Builder::new_multi_thread().enable_all().build().map_err(Failure::failed)
+    tokio::runtime::Builder::new_multi_thread()
+        .enable_all()
+        .build()
+        .map_err(Failure::failed)
 }
 
 fn ground(arguments: GroundArguments) -> Result<(), Failure> {
@@ -130,6 +133,10 @@ fn ground(arguments: GroundArguments) -> Result<(), Failure> {
     };
     let ended = runtime()?.block_on(crate::ground::run(&arguments.config, overrides));
     ended.map_err(|error| {
-        if error.is_refusal() { Failure::refused(error) } else { Failure::failed(error) }
+        if error.is_refusal() {
+            Failure::refused(error)
+        } else {
+            Failure::failed(error)
+        }
     })
 }

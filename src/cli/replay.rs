@@ -1,11 +1,11 @@
 //! `emberfix replay MISSION RECORDING --out DIR`.
 
 use super::{Failure, detector};
+use crate::alarm::FireId;
 use crate::mission::Mission;
 use crate::pipeline::Pipeline;
-use crate::replay::{Replay, ReplayError, telemetry_log};
-use crate::alarm::FireId;
 use crate::range::SgbmRanger;
+use crate::replay::{Replay, ReplayError, telemetry_log};
 use indicatif::{ProgressBar, ProgressStyle};
 use std::path::{Path, PathBuf};
 
@@ -30,13 +30,21 @@ pub struct ReplayArguments {
 /// Replays, writes, prints.
 pub fn replay(arguments: &ReplayArguments) -> Result<(), Failure> {
     let mission = Mission::load(&arguments.mission).map_err(Failure::refused)?;
-    let summary = if arguments.recording.extension().is_some_and(|ending| ending == "tlog") {
+    let summary = if arguments
+        .recording
+        .extension()
+        .is_some_and(|ending| ending == "tlog")
+    {
         telemetry_log(&arguments.recording, &arguments.out)
     } else {
         images_and_telemetry(&mission, arguments)?
     };
     let summary = summary.map_err(|error| {
-        if error.is_refusal() { Failure::refused(error) } else { Failure::failed(error) }
+        if error.is_refusal() {
+            Failure::refused(error)
+        } else {
+            Failure::failed(error)
+        }
     })?;
     if arguments.json {
         println!("{:#}", summary);

@@ -50,12 +50,23 @@ pub fn run(arguments: RunArguments) -> Result<(), Failure> {
     let detector = detector(&mission, arguments.boxes.as_deref())?;
     let ranger = SgbmRanger::new(&mission.rig, mission.range.clone()).map_err(Failure::refused)?;
     let fail = |error: ServiceError| {
-        if error.is_refusal() { Failure::refused(error) } else { Failure::failed(error) }
+        if error.is_refusal() {
+            Failure::refused(error)
+        } else {
+            Failure::failed(error)
+        }
     };
     let mut outbox = service::open_outbox(&mission).map_err(fail)?;
-    let first = outbox.next_fire_number().map_err(|error| fail(error.into()))?;
+    let first = outbox
+        .next_fire_number()
+        .map_err(|error| fail(error.into()))?;
     let pipeline = Pipeline::new(&mission, detector, Box::new(ranger), first);
     runtime()?
-        .block_on(service::run(mission, pipeline, outbox, arguments.record.as_deref()))
+        .block_on(service::run(
+            mission,
+            pipeline,
+            outbox,
+            arguments.record.as_deref(),
+        ))
         .map_err(fail)
 }

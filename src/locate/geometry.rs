@@ -109,9 +109,9 @@ impl<'a> View<'a> {
         let cam_to_mission: Rotation<CamLeft, MissionEnu> = rig.body_from_cam_left() * to_mission;
         let enu_from_body = rotation_matrix(&to_mission);
         let body_enu = mission_from_ecef.transform(Coordinate::<Ecef>::from_wgs84(&pose.place));
-        let up_at_vehicle = rotation_matrix(
-            &(ecef_from_vehicle.rotation() * mission_from_ecef.rotation()),
-        ) * Vector3::z();
+        let up_at_vehicle =
+            rotation_matrix(&(ecef_from_vehicle.rotation() * mission_from_ecef.rotation()))
+                * Vector3::z();
         Self {
             rig,
             pose,
@@ -186,7 +186,10 @@ impl<'a> View<'a> {
             flat(down.into_owned()),
         ]);
         let noise = self.pose.attitude_noise_rad;
-        let sigmas = SVector::<f64, 2>::new((sigma_u / focal).hypot(noise), (sigma_v / focal).hypot(noise));
+        let sigmas = SVector::<f64, 2>::new(
+            (sigma_u / focal).hypot(noise),
+            (sigma_v / focal).hypot(noise),
+        );
         let p = self.pose.position_noise_m;
         Covariance::from_sources(&jacobian, &sigmas) + Covariance::from_sigmas_m(p, p, p)
     }
@@ -198,7 +201,8 @@ impl<'a> View<'a> {
         // cross product with the line of sight; GNSS moves it as it moves the camera.
         let sight = point - self.camera_enu;
         let mut by = SMatrix::<f64, 3, SHARED>::zeros();
-        by.fixed_view_mut::<3, 3>(0, Shared::GnssEast as usize).copy_from(&Matrix3::identity());
+        by.fixed_view_mut::<3, 3>(0, Shared::GnssEast as usize)
+            .copy_from(&Matrix3::identity());
         let heading_axis = -self.up;
         by.set_column(Shared::Heading as usize, &heading_axis.cross(&sight));
         for axis in 0..3 {
@@ -207,7 +211,10 @@ impl<'a> View<'a> {
         }
         let rate = self.enu_from_body * self.pose.rate_rad_s;
         // Reported pose is that of `clock` seconds later than the exposure.
-        by.set_column(Shared::Clock as usize, &(self.pose.velocity_enu_m_s + rate.cross(&sight)));
+        by.set_column(
+            Shared::Clock as usize,
+            &(self.pose.velocity_enu_m_s + rate.cross(&sight)),
+        );
         by.set_column(Shared::Disparity as usize, &self.point_by_disparity(&sight));
         by
     }
@@ -248,11 +255,8 @@ impl<'a> View<'a> {
             focal / x.z, 0.0, -focal * x.x / (x.z * x.z),
             0.0, focal / x.z, -focal * x.y / (x.z * x.z),
         );
-        let disparity_by_x = SMatrix::<f64, 1, 3>::new(
-            0.0,
-            0.0,
-            -focal * self.rig.baseline_m() / (x.z * x.z),
-        );
+        let disparity_by_x =
+            SMatrix::<f64, 1, 3>::new(0.0, 0.0, -focal * self.rig.baseline_m() / (x.z * x.z));
         // The disparity offset adds to the disparity itself, not to where the point is seen.
         let mut moved = self.position_by_shared(point);
         moved.set_column(Shared::Disparity as usize, &Vector3::zeros());
@@ -260,7 +264,10 @@ impl<'a> View<'a> {
         let mut disparity_by_shared = disparity_by_x * x_by_shared;
         disparity_by_shared[Shared::Disparity as usize] = 1.0;
         Some(Predicted {
-            pixel: RectifiedPixel { u: focal * x.x / x.z + cx, v: focal * x.y / x.z + cy },
+            pixel: RectifiedPixel {
+                u: focal * x.x / x.z + cx,
+                v: focal * x.y / x.z + cy,
+            },
             depth_m: x.z,
             by_position: pixel_by_x * cam_from_enu,
             by_shared: pixel_by_x * x_by_shared,

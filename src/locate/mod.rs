@@ -16,9 +16,7 @@ pub use terrain::{ConstantPlane, Terrain, TerrainHit, meet_terrain};
 
 use crate::alarm::Method;
 use emberfix_calib::RectifiedPixel;
-use emberfix_frames::{
-    Coordinate, Covariance, Metres, MissionEnu, ServiceTime, Wgs84,
-};
+use emberfix_frames::{Coordinate, Covariance, Metres, MissionEnu, ServiceTime, Wgs84};
 
 /// One detection, in the pixels of the rectified left image.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -77,24 +75,36 @@ const MAX_RELATIVE_SIGMA: f64 = 0.5;
 #[must_use]
 pub fn fix(sighting: &Sighting, view: &View<'_>, terrain: Option<&dyn Terrain>) -> Option<Fix> {
     let ray = view.ray_enu(sighting.base);
-    let stereo = sighting.disparity.and_then(|d| stereo_range(sighting, &d, view));
+    let stereo = sighting
+        .disparity
+        .and_then(|d| stereo_range(sighting, &d, view));
     let on_ground = terrain.and_then(|t| match meet_terrain(&view.camera_enu, &ray, t, view) {
         TerrainHit::Met { range_m, sigma_m } => Some((range_m, sigma_m)),
         TerrainHit::Above | TerrainHit::Grazing | TerrainHit::Unknown => None,
     });
-    let on_ground =
-        on_ground.filter(|(range, _)| sighting.at_least_m.is_none_or(|least| *range >= 0.7 * least));
+    let on_ground = on_ground.filter(|(range, _)| {
+        sighting
+            .at_least_m
+            .is_none_or(|least| *range >= 0.7 * least)
+    });
     let (range_m, sigma_m, methods) = weigh(stereo, on_ground)?;
     if range_m > FURTHEST_M || sigma_m > MAX_RELATIVE_SIGMA * range_m {
         return None;
     }
     let point = view.camera_enu + ray * range_m;
     let along = Covariance::from_sources(&ray, &nalgebra::vector![sigma_m]);
-    let covariance = along + view.across_covariance(&ray, range_m, sighting.base_sigma_px)
+    let covariance = along
+        + view.across_covariance(&ray, range_m, sighting.base_sigma_px)
         + view.shared_covariance(&point);
     let enu = Coordinate::from_metres(point);
     let place = view.place(&enu)?;
-    Some(Fix { place, enu, covariance, methods, range_m })
+    Some(Fix {
+        place,
+        enu,
+        covariance,
+        methods,
+        range_m,
+    })
 }
 
 /// Slant range along the base's ray and its sigma, from disparity: the flame's upright axis is
@@ -105,7 +115,8 @@ fn stereo_range(sighting: &Sighting, d: &DisparityOf, view: &View<'_>) -> Option
     let ray = view.ray_enu(sighting.base);
     let range = view.range_beneath(&centroid, &ray)?;
     // dZ/dd = -Z² / (f b)
-    let metres_per_px = depth * depth / (view.rig.rectification().focal_px() * view.rig.baseline_m());
+    let metres_per_px =
+        depth * depth / (view.rig.rectification().focal_px() * view.rig.baseline_m());
     Some((range, metres_per_px * d.sigma_px * range / depth))
 }
 
@@ -121,7 +132,11 @@ fn weigh(
         (Some((a, sa)), Some((b, sb))) => {
             let (wa, wb) = (sa.powi(-2), sb.powi(-2));
             let range = (a * wa + b * wb) / (wa + wb);
-            Some((range, (wa + wb).powf(-0.5), vec![Method::Stereo, Method::Terrain]))
+            Some((
+                range,
+                (wa + wb).powf(-0.5),
+                vec![Method::Stereo, Method::Terrain],
+            ))
         }
     }
 }

@@ -1,9 +1,7 @@
 //! The ground, and where a ray meets it.
 
 use super::View;
-use emberfix_frames::{
-    Coordinate, EllipsoidHeight, Metres, Vector3, Wgs84, Wgs84Parts,
-};
+use emberfix_frames::{Coordinate, EllipsoidHeight, Metres, Vector3, Wgs84, Wgs84Parts};
 
 /// Height of the ground at a place.
 pub trait Terrain: Send + Sync {
@@ -105,5 +103,8 @@ fn slope_at(range: f64, above: &dyn Fn(f64) -> Option<(f64, f64)>) -> TerrainHit
     if sink < GRAZING {
         return TerrainHit::Grazing;
     }
-    TerrainHit::Met { range_m: range, sigma_m: sigma / sink }
+    TerrainHit::Met {
+        range_m: range,
+        sigma_m: sigma / sink,
+    }
 }

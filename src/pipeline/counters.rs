@@ -13,13 +13,22 @@ pub struct Counters {
 impl Counters {
     /// Adds one to `name` in `group`.
     pub fn add(&mut self, group: &'static str, name: &'static str) {
-        let count = self.groups.entry(group).or_default().entry(name).or_default();
+        let count = self
+            .groups
+            .entry(group)
+            .or_default()
+            .entry(name)
+            .or_default();
         *count = count.saturating_add(1);
     }
 
     /// How often `name` in `group` was counted.
     #[must_use]
     pub fn get(&self, group: &str, name: &str) -> u64 {
-        self.groups.get(group).and_then(|names| names.get(name)).copied().unwrap_or(0)
+        self.groups
+            .get(group)
+            .and_then(|names| names.get(name))
+            .copied()
+            .unwrap_or(0)
     }
 }

@@ -26,8 +26,8 @@ use crate::range::Ranger;
 use crate::track::{Fire, Outcome, Tracker};
 use emberfix_calib::Rig;
 use emberfix_frames::{
-    ServiceTime, SignedDuration, Stamped, TimeSyncSample, Wgs84, Wgs84Parts, ecef_from_enu, place_from_ecef,
-    seconds,
+    ServiceTime, SignedDuration, Stamped, TimeSyncSample, Wgs84, Wgs84Parts, ecef_from_enu,
+    place_from_ecef, seconds,
 };
 use emberfix_mav::telemetry::{GpsRaw, TimeSyncMessage};
 use emberfix_mav::{Address, Received, SystemId, Telemetry};
@@ -212,13 +212,20 @@ impl Pipeline {
     fn take_telemetry(&mut self, telemetry: &Telemetry) {
         match telemetry {
             Telemetry::Attitude(sample) => {
-                self.poses.add_attitude(sample.boot, self.now, sample.attitude, sample.rate_rad_s);
+                self.poses
+                    .add_attitude(sample.boot, self.now, sample.attitude, sample.rate_rad_s);
                 self.counters.add("telemetry", "attitude");
             }
             Telemetry::GlobalPosition(position) => {
                 let degrees = (position.latitude_deg, position.longitude_deg);
                 let velocity = position.velocity_ned_m_s;
-                self.poses.add_position(position.boot, self.now, degrees, position.altitude, velocity);
+                self.poses.add_position(
+                    position.boot,
+                    self.now,
+                    degrees,
+                    position.altitude,
+                    velocity,
+                );
                 self.last_position = Some(self.now);
                 self.counters.add("telemetry", "position");
             }
@@ -231,11 +238,20 @@ impl Pipeline {
     }
 
     fn take_gnss(&mut self, raw: &GpsRaw) {
-        let separation =
-            raw.place.and_then(|place| place.height.map(|height| height - place.altitude));
+        let separation = raw
+            .place
+            .and_then(|place| place.height.map(|height| height - place.altitude));
         let sigmas = (raw.horizontal_sigma_m, raw.vertical_sigma_m);
-        self.poses.add_gnss(self.now, raw.fix.is_3d(), sigmas, separation);
-        self.counters.add("telemetry", if raw.fix.is_3d() { "gnss_3d" } else { "gnss_no_3d" });
+        self.poses
+            .add_gnss(self.now, raw.fix.is_3d(), sigmas, separation);
+        self.counters.add(
+            "telemetry",
+            if raw.fix.is_3d() {
+                "gnss_3d"
+            } else {
+                "gnss_no_3d"
+            },
+        );
     }
 
     /// Replies carry our own clock in `ts1`; a live service filters those that it never asked for
@@ -249,7 +265,8 @@ impl Pipeline {
             remote: emberfix_frames::BootTime::from_ns(sync.tc1_ns),
             answered: self.now,
         });
-        self.counters.add("timesync", if taken { "taken" } else { "refused" });
+        self.counters
+            .add("timesync", if taken { "taken" } else { "refused" });
     }
 
     fn take_pair(&mut self, pair: Box<Stamped<StereoPair>>) {
@@ -285,12 +302,16 @@ impl Pipeline {
             PoseAnswer::NeverSeen { what } => self.without_pose("pose_never_seen", || {
                 format!("no {what} has come from the autopilot")
             }),
-            PoseAnswer::Stale { what, nearest, limit } => self.without_pose("pose_stale", || {
+            PoseAnswer::Stale {
+                what,
+                nearest,
+                limit,
+            } => self.without_pose("pose_stale", || {
                 format!("{what} is {nearest:#} away from the shutter, limit {limit:#}")
             }),
-            PoseAnswer::NoGnssFix => {
-                self.without_pose("no_gnss_fix", || "GNSS has no 3D fix: no positions".to_owned())
-            }
+            PoseAnswer::NoGnssFix => self.without_pose("no_gnss_fix", || {
+                "GNSS has no 3D fix: no positions".to_owned()
+            }),
         }
     }
 
@@ -312,13 +333,20 @@ impl Pipeline {
             self.degraded.push(crate::pose::Degraded::Mono.name());
         }
         let terrain = self.terrain.clone();
-        let sightings: Vec<_> = seen.sightings.iter().map(|(_, sighting)| *sighting).collect();
+        let sightings: Vec<_> = seen
+            .sightings
+            .iter()
+            .map(|(_, sighting)| *sighting)
+            .collect();
         let outcomes = self.tracker.step(&view, &sightings, terrain.as_deref());
         let mut outputs = vec![Output::Pose(Box::new(pose.clone()))];
         for outcome in &outcomes {
             outputs.push(self.fix_output(&seen, outcome, &view));
         }
-        outputs.push(Output::Detections { at: pair.at, found: seen.found });
+        outputs.push(Output::Detections {
+            at: pair.at,
+            found: seen.found,
+        });
         outputs.extend(self.alarms());
         outputs
     }
@@ -328,12 +356,19 @@ impl Pipeline {
         let at = classified.sighting.at;
         let situation = outcome.fix.as_ref().map(|fix| {
             let mut situation = situate(&fix.place, &mut self.poses, self.terrain.as_deref());
-            situation.degraded = self.degraded.iter().map(|reason| (*reason).to_owned()).collect();
+            situation.degraded = self
+                .degraded
+                .iter()
+                .map(|reason| (*reason).to_owned())
+                .collect();
             situation
         });
         let box_px = seen.found[*found].box_px;
         let feature = feature::sighting(classified, outcome, box_px, situation.as_ref(), view);
-        Output::Fix { at, feature: self.desk.signed(outcome.fire, feature) }
+        Output::Fix {
+            at,
+            feature: self.desk.signed(outcome.fire, feature),
+        }
     }
 
     fn alarms(&mut self) -> Vec<Output> {
@@ -343,10 +378,15 @@ impl Pipeline {
             let place = place_from_ecef(&ecef_from_enu(&datum).transform(fire.position()))?;
             let mut situation = situate(&place, poses, terrain.as_deref());
             situation.degraded = degraded.iter().map(|reason| (*reason).to_owned()).collect();
-            situation.degraded.extend(fire.merged_into.map(|into| format!("merged_into_{}", into.0)));
+            situation.degraded.extend(
+                fire.merged_into
+                    .map(|into| format!("merged_into_{}", into.0)),
+            );
             Some(situation)
         });
-        due.into_iter().map(|alarm| Output::Alarm(Box::new(alarm))).collect()
+        due.into_iter()
+            .map(|alarm| Output::Alarm(Box::new(alarm)))
+            .collect()
     }
 }
 

@@ -58,7 +58,11 @@ impl Vision {
     /// Looks at a pair. `None` when the left eye shows nothing that can be trusted; why is counted.
     pub fn look(&mut self, pair: &Stamped<StereoPair>, counters: &mut Counters) -> Option<Seen> {
         let bgr = self.left(&pair.value.left, counters)?;
-        let image = LeftImage { at: pair.at, sequence: pair.value.sequence, bgr };
+        let image = LeftImage {
+            at: pair.at,
+            sequence: pair.value.sequence,
+            bgr,
+        };
         let found = match self.detector.detect(&image) {
             Ok(found) => found,
             Err(error) => {
@@ -69,14 +73,22 @@ impl Vision {
         };
         counters.add("pairs", "looked_at");
         let right_gray = self.right(pair.value.right.as_ref(), counters);
-        let raw = RawPair { at: pair.at, left_bgr: image.bgr, right_gray };
+        let raw = RawPair {
+            at: pair.at,
+            left_bgr: image.bgr,
+            right_gray,
+        };
         let mut sightings = Vec::new();
         for (index, detection) in found.iter().enumerate() {
             if let Some(classified) = self.sighting(&raw, detection, counters) {
                 sightings.push((index, classified));
             }
         }
-        Some(Seen { found, sightings, mono: raw.right_gray.is_none() })
+        Some(Seen {
+            found,
+            sightings,
+            mono: raw.right_gray.is_none(),
+        })
     }
 
     fn left(&mut self, image: &EncodedImage, counters: &mut Counters) -> Option<Mat> {
@@ -118,7 +130,10 @@ impl Vision {
             DetectionClass::Smoke => AlarmClass::Smoke,
             DetectionClass::NonFire => return None,
         };
-        let target = Target { class: detection.class, box_px: detection.box_px };
+        let target = Target {
+            class: detection.class,
+            box_px: detection.box_px,
+        };
         let ranging = match self.ranger.range(pair, &target) {
             Ok(ranging) => ranging,
             Err(error) => {
@@ -129,7 +144,11 @@ impl Vision {
         };
         counters.add("range", name_of(&ranging));
         let sighting = self.place_in_rectified(pair, &detection.box_px, &ranging)?;
-        Some(Classified { sighting, class, score: detection.score })
+        Some(Classified {
+            sighting,
+            class,
+            score: detection.score,
+        })
     }
 
     fn place_in_rectified(
@@ -140,23 +159,40 @@ impl Vision {
     ) -> Option<Sighting> {
         let (u, v) = box_px.base();
         let rectification = self.rig.rectification();
-        let base: RectifiedPixel =
-            *rectification.rectify(Eye::Left, &[RawPixel { u, v }]).ok()?.first()?;
+        let base: RectifiedPixel = *rectification
+            .rectify(Eye::Left, &[RawPixel { u, v }])
+            .ok()?
+            .first()?;
         let camera = self.rig.camera(Eye::Left);
-        let scale =
-            (rectification.focal_px() / camera.focal_px.0, rectification.focal_px() / camera.focal_px.1);
+        let scale = (
+            rectification.focal_px() / camera.focal_px.0,
+            rectification.focal_px() / camera.focal_px.1,
+        );
         let size_px = (box_px.width * scale.0, box_px.height * scale.1);
         let (disparity, at_least_m) = match *ranging {
-            Ranging::Measured { disparity_px, sigma_px, centroid, .. } => {
-                (Some(DisparityOf { px: disparity_px, sigma_px, centroid }), None)
-            }
+            Ranging::Measured {
+                disparity_px,
+                sigma_px,
+                centroid,
+                ..
+            } => (
+                Some(DisparityOf {
+                    px: disparity_px,
+                    sigma_px,
+                    centroid,
+                }),
+                None,
+            ),
             Ranging::BeyondReach { at_least_m } => (None, Some(at_least_m)),
             Ranging::NoMatch => (None, None),
         };
         Some(Sighting {
             at: pair.at,
             base,
-            base_sigma_px: (EDGE_PX.max(EDGE_SHARE * size_px.0), EDGE_PX.max(EDGE_SHARE * size_px.1)),
+            base_sigma_px: (
+                EDGE_PX.max(EDGE_SHARE * size_px.0),
+                EDGE_PX.max(EDGE_SHARE * size_px.1),
+            ),
             size_px,
             disparity,
             glow: glow(&pair.left_bgr, box_px),

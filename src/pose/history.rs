@@ -28,7 +28,9 @@ impl<T: Copy> History<T> {
     /// Empty.
     #[must_use]
     pub fn new() -> Self {
-        Self { samples: VecDeque::new() }
+        Self {
+            samples: VecDeque::new(),
+        }
     }
 
     /// Takes a sample in; a second sample of the same moment is dropped.
@@ -59,13 +61,20 @@ impl<T: Copy> History<T> {
     pub fn bracket(&self, at: BootTime) -> Option<Bracket<T>> {
         let after = self.samples.partition_point(|(when, _)| *when <= at);
         let earlier = *self.samples.get(after.checked_sub(1)?)?;
-        Some(Bracket { at, earlier, later: self.samples.get(after).copied() })
+        Some(Bracket {
+            at,
+            earlier,
+            later: self.samples.get(after).copied(),
+        })
     }
 
     /// How far the nearest sample is from a moment, if there is one.
     #[must_use]
     pub fn nearest_distance(&self, at: BootTime) -> Option<SignedDuration> {
-        self.samples.iter().map(|(when, _)| (*when - at).abs()).min()
+        self.samples
+            .iter()
+            .map(|(when, _)| (*when - at).abs())
+            .min()
     }
 }
 
@@ -80,7 +89,11 @@ impl<T: Copy> Bracket<T> {
     #[must_use]
     pub fn share(&self) -> f64 {
         let span = self.span_s();
-        if self.later.is_some() && span > 0.0 { self.age_s() / span } else { 0.0 }
+        if self.later.is_some() && span > 0.0 {
+            self.age_s() / span
+        } else {
+            0.0
+        }
     }
 
     /// Seconds from the earlier sample to the moment.
@@ -111,7 +124,8 @@ impl<T: Copy> Bracket<T> {
     #[must_use]
     pub fn distance(&self) -> SignedDuration {
         let before = self.at - self.earlier.0;
-        self.later.map_or(before, |(later, _)| before.min(later - self.at))
+        self.later
+            .map_or(before, |(later, _)| before.min(later - self.at))
     }
 
     /// The sample nearer to the moment.

@@ -18,8 +18,8 @@ pub use history::{Bracket, History};
 
 use emberfix_frames::{
     Attitude, BootTime, EllipsoidHeight, Geoid, GeoidUndulation, MslAltitude, ServiceTime,
-    SignedDuration, SyncQuality, TimeSync, TimeSyncSample, Vector3, Wgs84, Wgs84Parts, ecef_from_enu,
-    place_from_degrees,
+    SignedDuration, SyncQuality, TimeSync, TimeSyncSample, Vector3, Wgs84, Wgs84Parts,
+    ecef_from_enu, place_from_degrees,
 };
 use emberfix_frames::{Coordinate, Metres, VehicleEnu};
 use std::collections::BTreeSet;
@@ -203,7 +203,13 @@ impl PoseEstimator {
         rate_rad_s: Vector3<f64>,
     ) {
         self.note_boot(boot, arrived);
-        self.attitudes.push(boot, AttitudeSample { attitude, rate_rad_s });
+        self.attitudes.push(
+            boot,
+            AttitudeSample {
+                attitude,
+                rate_rad_s,
+            },
+        );
     }
 
     /// Takes a global position sample in; velocity is north, east, down in m/s.
@@ -220,7 +226,12 @@ impl PoseEstimator {
         let velocity_enu_m_s = Vector3::new(v.y, v.x, -v.z);
         self.positions.push(
             boot,
-            PositionSample { latitude_deg, longitude_deg, altitude, velocity_enu_m_s },
+            PositionSample {
+                latitude_deg,
+                longitude_deg,
+                altitude,
+                velocity_enu_m_s,
+            },
         );
     }
 
@@ -234,8 +245,12 @@ impl PoseEstimator {
         separation: Option<GeoidUndulation>,
     ) {
         let (horizontal_m, vertical_m) = sigmas_m;
-        self.gnss =
-            Some(GnssQuality { at: arrived, has_fix: has_3d_fix, horizontal_m, vertical_m });
+        self.gnss = Some(GnssQuality {
+            at: arrived,
+            has_fix: has_3d_fix,
+            horizontal_m,
+            vertical_m,
+        });
         if let Some(n) = separation.filter(|_| has_3d_fix) {
             let old = self.separation.unwrap_or(n.m());
             self.separation = Some(old + SEPARATION_GAIN * (n.m() - old));
@@ -257,7 +272,9 @@ impl PoseEstimator {
     pub fn undulation(&mut self, place: &Wgs84) -> GeoidUndulation {
         match self.separation {
             Some(separation) => GeoidUndulation::from_m(separation),
-            None => self.geoid.undulation(place.latitude_deg(), place.longitude_deg()),
+            None => self
+                .geoid
+                .undulation(place.latitude_deg(), place.longitude_deg()),
         }
     }
 
@@ -265,23 +282,43 @@ impl PoseEstimator {
     /// arrival; it decides whether to wait for a sample on the far side.
     pub fn at(&mut self, moment: ServiceTime, now: ServiceTime) -> PoseAnswer {
         let Some(boot) = self.sync.to_boot(moment) else {
-            return PoseAnswer::NeverSeen { what: "autopilot clock" };
+            return PoseAnswer::NeverSeen {
+                what: "autopilot clock",
+            };
         };
         let waiting = now - moment < WAIT;
-        let attitude = match bracket(&self.attitudes, boot, "attitude", self.config.limit, waiting) {
+        let attitude = match bracket(
+            &self.attitudes,
+            boot,
+            "attitude",
+            self.config.limit,
+            waiting,
+        ) {
             Ok(bracket) => bracket,
             Err(answer) => return answer,
         };
-        let position = match bracket(&self.positions, boot, "position", self.config.limit, waiting) {
+        let position = match bracket(
+            &self.positions,
+            boot,
+            "position",
+            self.config.limit,
+            waiting,
+        ) {
             Ok(bracket) => bracket,
             Err(answer) => return answer,
         };
         let Some(gnss) = self.gnss else {
-            return PoseAnswer::NeverSeen { what: "GNSS quality" };
+            return PoseAnswer::NeverSeen {
+                what: "GNSS quality",
+            };
         };
         if now - gnss.at > GNSS_QUALITY_LIMIT {
             let (nearest, limit) = (now - gnss.at, GNSS_QUALITY_LIMIT);
-            return PoseAnswer::Stale { what: "GNSS quality", nearest, limit };
+            return PoseAnswer::Stale {
+                what: "GNSS quality",
+                nearest,
+                limit,
+            };
         }
         if !gnss.has_fix {
             return PoseAnswer::NoGnssFix;
@@ -313,16 +350,21 @@ impl PoseEstimator {
             degraded.insert(Degraded::GnssAccuracyUnknown);
         }
         let Some(place) = self.place(position) else {
-            return PoseAnswer::NeverSeen { what: "a position on the Earth" };
+            return PoseAnswer::NeverSeen {
+                what: "a position on the Earth",
+            };
         };
         let (near, share) = (attitude.nearest(), attitude.share());
         let turned = match attitude.later {
             Some((_, later)) => attitude.earlier.1.attitude.slerp(&later.attitude, share),
-            None => attitude.earlier.1.attitude.rotated(near.rate_rad_s, attitude.age_s()),
+            None => attitude
+                .earlier
+                .1
+                .attitude
+                .rotated(near.rate_rad_s, attitude.age_s()),
         };
-        let sigma = |own: Option<f64>, default: f64| {
-            own.unwrap_or(default).max(self.config.gnss_floor_m)
-        };
+        let sigma =
+            |own: Option<f64>, default: f64| own.unwrap_or(default).max(self.config.gnss_floor_m);
         PoseAnswer::Fresh(Box::new(Pose {
             at: moment,
             place,
@@ -369,7 +411,10 @@ impl PoseEstimator {
 
     fn note_boot(&mut self, boot: BootTime, arrived: ServiceTime) {
         self.sync.add_arrival(boot, arrived);
-        let rebooted = self.attitudes.latest().is_some_and(|last| boot < last - REBOOT);
+        let rebooted = self
+            .attitudes
+            .latest()
+            .is_some_and(|last| boot < last - REBOOT);
         if rebooted {
             self.attitudes.clear();
             self.positions.clear();
@@ -395,13 +440,21 @@ fn bracket<T: Copy>(
         let Some(nearest) = history.nearest_distance(boot) else {
             return Err(PoseAnswer::NeverSeen { what });
         };
-        return Err(PoseAnswer::Stale { what, nearest, limit });
+        return Err(PoseAnswer::Stale {
+            what,
+            nearest,
+            limit,
+        });
     };
     if found.later.is_none() && waiting {
         return Err(PoseAnswer::NotYet);
     }
     if found.distance() > limit {
-        return Err(PoseAnswer::Stale { what, nearest: found.distance(), limit });
+        return Err(PoseAnswer::Stale {
+            what,
+            nearest: found.distance(),
+            limit,
+        });
     }
     Ok(found)
 }
@@ -416,7 +469,6 @@ fn hermite(step: Vector3<f64>, m0: Vector3<f64>, m1: Vector3<f64>, s: f64) -> Ve
     let (s2, s3) = (s * s, s * s * s);
     m0 * (s3 - 2.0 * s2 + s) + step * (3.0 * s2 - 2.0 * s3) + m1 * (s3 - s2)
 }
-
 
 #[cfg(test)]
 mod tests;

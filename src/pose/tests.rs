@@ -14,7 +14,11 @@ fn synced() -> PoseEstimator {
         let asked = service(100 * i);
         let answered = service(100 * i + 2);
         let remote = BootTime::from_ms(u32::try_from(100 * i + 1).unwrap());
-        assert!(poses.add_timesync(TimeSyncSample { asked, remote, answered }));
+        assert!(poses.add_timesync(TimeSyncSample {
+            asked,
+            remote,
+            answered
+        }));
     }
     poses
 }
@@ -34,12 +38,22 @@ fn position(poses: &mut PoseEstimator, ms: u32, north_m: f64, north_m_s: f64) {
 fn attitude(poses: &mut PoseEstimator, ms: u32, heading_rad: f64) {
     let attitude = Attitude::from_angles(0.0, 0.0, heading_rad);
     let rate = Vector3::zeros();
-    poses.add_attitude(BootTime::from_ms(ms), service(i64::from(ms) + 3), attitude, rate);
+    poses.add_attitude(
+        BootTime::from_ms(ms),
+        service(i64::from(ms) + 3),
+        attitude,
+        rate,
+    );
 }
 
 fn gnss(poses: &mut PoseEstimator, ms: i64, fix: bool) {
     let sigmas = (Some(1.2), Some(2.0));
-    poses.add_gnss(service(ms), fix, sigmas, Some(GeoidUndulation::from_m(10.0)));
+    poses.add_gnss(
+        service(ms),
+        fix,
+        sigmas,
+        Some(GeoidUndulation::from_m(10.0)),
+    );
 }
 
 fn flying() -> PoseEstimator {
@@ -66,7 +80,10 @@ fn position_and_attitude_are_those_of_mid_exposure() {
     let start = place_from_degrees(31.0, 119.0, EllipsoidHeight::from_m(30.0)).unwrap();
     let moved = emberfix_frames::enu_offset(&start, &pose.place);
     // 110863 m per degree is good to 1e-5 of the 0.5 m moved.
-    assert!((moved - Vector3::new(0.0, 0.5, 0.0)).norm() < 1e-3, "{moved}");
+    assert!(
+        (moved - Vector3::new(0.0, 0.5, 0.0)).norm() < 1e-3,
+        "{moved}"
+    );
     assert!(pose.degraded.is_empty(), "{:?}", pose.degraded);
 }
 
@@ -102,7 +119,10 @@ fn heading_turns_the_short_way_over_north() {
 
 #[test]
 fn an_image_waits_for_the_telemetry_that_follows_it() {
-    assert_eq!(flying().at(service(2105), service(2120)), PoseAnswer::NotYet);
+    assert_eq!(
+        flying().at(service(2105), service(2120)),
+        PoseAnswer::NotYet
+    );
     // After the wait it is extrapolated: 5 ms at 10 m/s.
     let pose = fresh(flying().at(service(2105), service(2400)));
     let start = place_from_degrees(31.0, 119.0, EllipsoidHeight::from_m(30.0)).unwrap();
@@ -113,12 +133,27 @@ fn an_image_waits_for_the_telemetry_that_follows_it() {
 #[test]
 fn stale_missing_and_fixless_telemetry_give_no_pose() {
     let old = flying().at(service(2700), service(3000));
-    assert!(matches!(old, PoseAnswer::Stale { what: "attitude", .. }), "{old:?}");
+    assert!(
+        matches!(
+            old,
+            PoseAnswer::Stale {
+                what: "attitude",
+                ..
+            }
+        ),
+        "{old:?}"
+    );
     let mut poses = flying();
     gnss(&mut poses, 2105, false);
-    assert_eq!(poses.at(service(2050), service(2110)), PoseAnswer::NoGnssFix);
+    assert_eq!(
+        poses.at(service(2050), service(2110)),
+        PoseAnswer::NoGnssFix
+    );
     let mut nothing = PoseEstimator::new(PoseConfig::default());
-    assert!(matches!(nothing.at(service(0), service(0)), PoseAnswer::NeverSeen { .. }));
+    assert!(matches!(
+        nothing.at(service(0), service(0)),
+        PoseAnswer::NeverSeen { .. }
+    ));
 }
 
 #[test]

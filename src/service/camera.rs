@@ -22,7 +22,10 @@ impl Slot {
 
     /// Takes the pair out, if there is one.
     pub fn take(&self) -> Option<Stamped<StereoPair>> {
-        self.pair.lock().unwrap_or_else(PoisonError::into_inner).take()
+        self.pair
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .take()
     }
 }
 
@@ -33,27 +36,29 @@ pub fn start(
     events: SyncSender<Input>,
     board: Arc<Board>,
 ) -> std::io::Result<JoinHandle<()>> {
-    std::thread::Builder::new().name("camera".to_owned()).spawn(move || {
-        let mut shed = 0_u64;
-        while !board.is_stopping() {
-            match source.next_pair() {
-                Ok(Some(pair)) => {
-                    shed += u64::from(slot.put(pair));
-                    // A full queue already holds a reason to look at the slot.
-                    let _told = events.try_send(Input::PairReady);
+    std::thread::Builder::new()
+        .name("camera".to_owned())
+        .spawn(move || {
+            let mut shed = 0_u64;
+            while !board.is_stopping() {
+                match source.next_pair() {
+                    Ok(Some(pair)) => {
+                        shed += u64::from(slot.put(pair));
+                        // A full queue already holds a reason to look at the slot.
+                        let _told = events.try_send(Input::PairReady);
+                    }
+                    Ok(None) => {
+                        tracing::info!("the camera source has ended");
+                        break;
+                    }
+                    Err(error) if error.is_fatal() => {
+                        tracing::error!(%error, "the camera source failed");
+                        break;
+                    }
+                    Err(error) => tracing::warn!(%error, "no pair"),
                 }
-                Ok(None) => {
-                    tracing::info!("the camera source has ended");
-                    break;
-                }
-                Err(error) if error.is_fatal() => {
-                    tracing::error!(%error, "the camera source failed");
-                    break;
-                }
-                Err(error) => tracing::warn!(%error, "no pair"),
             }
-        }
-        let counters = source.counters();
-        tracing::info!(?counters, shed, "camera thread ends");
-    })
+            let counters = source.counters();
+            tracing::info!(?counters, shed, "camera thread ends");
+        })
 }

@@ -52,22 +52,26 @@ pub fn start(
     inbox: Receiver<Input>,
     slot: Slot,
 ) -> std::io::Result<JoinHandle<()>> {
-    std::thread::Builder::new().name("pipeline".to_owned()).spawn(move || {
-        let mut reported = Instant::now();
-        while !core.board.is_stopping() {
-            match inbox.recv_timeout(PATIENCE) {
-                Ok(Input::Mavlink { arrived, received }) => core.take_mavlink(arrived, received),
-                Ok(Input::PairReady) => core.take_pair(&slot),
-                Err(RecvTimeoutError::Timeout) => {}
-                Err(RecvTimeoutError::Disconnected) => break,
+    std::thread::Builder::new()
+        .name("pipeline".to_owned())
+        .spawn(move || {
+            let mut reported = Instant::now();
+            while !core.board.is_stopping() {
+                match inbox.recv_timeout(PATIENCE) {
+                    Ok(Input::Mavlink { arrived, received }) => {
+                        core.take_mavlink(arrived, received)
+                    }
+                    Ok(Input::PairReady) => core.take_pair(&slot),
+                    Err(RecvTimeoutError::Timeout) => {}
+                    Err(RecvTimeoutError::Disconnected) => break,
+                }
+                if reported.elapsed() > REPORT {
+                    reported = Instant::now();
+                    core.report();
+                }
             }
-            if reported.elapsed() > REPORT {
-                reported = Instant::now();
-                core.report();
-            }
-        }
-        core.end();
-    })
+            core.end();
+        })
 }
 
 impl Core {
@@ -94,7 +98,9 @@ impl Core {
         if let Some(recorder) = &self.recorder {
             recorder.write_pair(&pair);
         }
-        let outputs = self.pipeline.handle(pair.value.arrived, Event::Pair(Box::new(pair)));
+        let outputs = self
+            .pipeline
+            .handle(pair.value.arrived, Event::Pair(Box::new(pair)));
         self.hand_on(outputs);
     }
 
@@ -127,13 +133,24 @@ impl Core {
             longitude_deg: pose.place.longitude_deg(),
             height_ellipsoid_m: pose.place.height().m(),
             heading_deg: Some(heading_deg),
-            health: if health.is_empty() { "ok".to_owned() } else { health.join("; ") },
+            health: if health.is_empty() {
+                "ok".to_owned()
+            } else {
+                health.join("; ")
+            },
         });
         if let Some(recorder) = &self.recorder {
             let (h, v) = (pose.gnss_horizontal_m, pose.gnss_vertical_m);
             let covariance = Covariance::from_sigmas_m(h, h, v);
             let heading_rad = Some(pose.attitude.angles().2);
-            recorder.write_uav_fix(pose.at, &UavFix { place: pose.place, covariance, heading_rad });
+            recorder.write_uav_fix(
+                pose.at,
+                &UavFix {
+                    place: pose.place,
+                    covariance,
+                    heading_rad,
+                },
+            );
             let (w, i, j, k) = pose.attitude.enu_from_body().to_quaternion();
             let quaternion = nalgebra::Quaternion::new(w, i, j, k);
             recorder.write_body_pose(

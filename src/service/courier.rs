@@ -30,7 +30,11 @@ impl HttpCourier {
             return Ok(None);
         };
         let link = HttpLink::new(url)?;
-        Ok(Some(Self { link, courier: Courier::new(), complained: false }))
+        Ok(Some(Self {
+            link,
+            courier: Courier::new(),
+            complained: false,
+        }))
     }
 
     /// Starts the thread. It ends when the service stops.
@@ -40,17 +44,19 @@ impl HttpCourier {
         board: Arc<Board>,
         clock: ServiceClock,
     ) -> std::io::Result<JoinHandle<()>> {
-        std::thread::Builder::new().name("http".to_owned()).spawn(move || {
-            let mut pinged = Instant::now();
-            while !board.is_stopping() {
-                while self.deliver_one(&outbox, &clock) {}
-                if pinged.elapsed() > PING {
-                    pinged = Instant::now();
-                    self.ping(&board);
+        std::thread::Builder::new()
+            .name("http".to_owned())
+            .spawn(move || {
+                let mut pinged = Instant::now();
+                while !board.is_stopping() {
+                    while self.deliver_one(&outbox, &clock) {}
+                    if pinged.elapsed() > PING {
+                        pinged = Instant::now();
+                        self.ping(&board);
+                    }
+                    std::thread::sleep(LOOK);
                 }
-                std::thread::sleep(LOOK);
-            }
-        })
+            })
     }
 
     /// Sends one alarm; true when another one may follow at once.

@@ -122,7 +122,9 @@ impl Board {
     pub fn is_healthy(&self) -> bool {
         let latest = self.latest();
         latest.health.problems.is_empty()
-            && latest.reported.is_some_and(|at| at.elapsed() < PIPELINE_SILENCE)
+            && latest
+                .reported
+                .is_some_and(|at| at.elapsed() < PIPELINE_SILENCE)
     }
 
     pub fn stop(&self) {
@@ -145,7 +147,9 @@ pub(crate) fn lock(outbox: &SharedOutbox) -> MutexGuard<'_, Outbox> {
 #[must_use]
 pub fn service_clock() -> ServiceClock {
     let begun = Instant::now();
-    let since_1970 = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    let since_1970 = SystemTime::now()
+        .duration_since(UNIX_EPOCH)
+        .unwrap_or_default();
     Arc::new(move || {
         let now = since_1970 + begun.elapsed();
         ServiceTime::from_unix_ns(i64::try_from(now.as_nanos()).unwrap_or(i64::MAX))
@@ -158,8 +162,10 @@ pub fn service_clock() -> ServiceClock {
 /// [`ServiceError::Folder`] or [`ServiceError::Outbox`].
 pub fn open_outbox(mission: &Mission) -> Result<Outbox, ServiceError> {
     let folder = &mission.state_dir;
-    std::fs::create_dir_all(folder)
-        .map_err(|source| ServiceError::Folder { path: folder.clone(), source })?;
+    std::fs::create_dir_all(folder).map_err(|source| ServiceError::Folder {
+        path: folder.clone(),
+        source,
+    })?;
     Ok(Outbox::open(&folder.join("outbox.sqlite"), &LINKS)?)
 }
 
@@ -204,9 +210,17 @@ pub async fn run(
         .map(|http| http.start(Arc::clone(&outbox), Arc::clone(&board), Arc::clone(&clock)))
         .transpose()
         .map_err(thread_failed)?;
-    let talk = telemetry::Talk::new(link, &mission, Arc::clone(&outbox), Arc::clone(&board), clock);
-    eprintln!("emberfix: ready, mission {}, MAVLink {}, camera {}",
-        mission.name, mission.mavlink_url, mission.camera_url);
+    let talk = telemetry::Talk::new(
+        link,
+        &mission,
+        Arc::clone(&outbox),
+        Arc::clone(&board),
+        clock,
+    );
+    eprintln!(
+        "emberfix: ready, mission {}, MAVLink {}, camera {}",
+        mission.name, mission.mavlink_url, mission.camera_url
+    );
     let mut talking = tokio::spawn(talk.run(events));
     tokio::select! {
         () = until_told_to_stop() => {}
@@ -214,7 +228,10 @@ pub async fn run(
     }
     board.stop();
     talking.abort();
-    for thread in [Some(working), Some(looking), telling].into_iter().flatten() {
+    for thread in [Some(working), Some(looking), telling]
+        .into_iter()
+        .flatten()
+    {
         // A thread that panicked has said so on standard error already.
         let _ended = tokio::task::spawn_blocking(move || thread.join()).await;
     }

@@ -141,11 +141,17 @@ impl Talk {
         if Some(sender.system) == self.vehicle() {
             *self.counted.entry(received.frame.message_id).or_default() += 1;
         }
-        let input = Input::Mavlink { arrived, received: Box::new(received) };
+        let input = Input::Mavlink {
+            arrived,
+            received: Box::new(received),
+        };
         if events.try_send(input).is_err() {
             self.shed += 1;
             if self.shed.is_power_of_two() {
-                tracing::warn!(shed = self.shed, "telemetry dropped: the pipeline does not keep up");
+                tracing::warn!(
+                    shed = self.shed,
+                    "telemetry dropped: the pipeline does not keep up"
+                );
             }
         }
     }
@@ -156,9 +162,14 @@ impl Talk {
         let autopilot =
             matches!(&received.telemetry, Ok(Telemetry::Heartbeat(h)) if h.is_autopilot());
         let system = received.system();
-        let ours = self.configured.is_none_or(|configured| configured == system);
+        let ours = self
+            .configured
+            .is_none_or(|configured| configured == system);
         if self.encoder.is_none() && autopilot && ours {
-            let own = Address { system, component: ComponentId::ONBOARD_COMPUTER };
+            let own = Address {
+                system,
+                component: ComponentId::ONBOARD_COMPUTER,
+            };
             self.encoder = Some(Encoder::new(own));
             self.delivery = Some(MavlinkDelivery::new(MavlinkSettings {
                 ground: self.agent,
@@ -198,7 +209,10 @@ impl Talk {
         let Some(vehicle) = self.vehicle() else {
             return;
         };
-        let autopilot = Address { system: vehicle, component: ComponentId::AUTOPILOT };
+        let autopilot = Address {
+            system: vehicle,
+            component: ComponentId::AUTOPILOT,
+        };
         if now >= self.heartbeat_due {
             self.heartbeat_due = now + HEARTBEAT;
             if self.board.is_healthy() {
@@ -227,8 +241,14 @@ impl Talk {
             let came_hz =
                 f64::from(counted.get(&id).copied().unwrap_or(0)) / RATE_CHECK.as_secs_f64();
             if came_hz < TOO_SLOW * wanted_hz {
-                tracing::info!(message = message_name(id), came_hz, wanted_hz, "asking for rate");
-                self.send(&set_message_interval(autopilot, id, wanted_hz)).await;
+                tracing::info!(
+                    message = message_name(id),
+                    came_hz,
+                    wanted_hz,
+                    "asking for rate"
+                );
+                self.send(&set_message_interval(autopilot, id, wanted_hz))
+                    .await;
             }
         }
     }
@@ -238,7 +258,11 @@ impl Talk {
             self.outbox_due = now + OUTBOX_LOOK;
             self.offer_pending();
         }
-        while let Some(message) = self.delivery.as_mut().and_then(|delivery| delivery.poll(now)) {
+        while let Some(message) = self
+            .delivery
+            .as_mut()
+            .and_then(|delivery| delivery.poll(now))
+        {
             self.send(&message).await;
         }
     }

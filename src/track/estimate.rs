@@ -3,9 +3,7 @@
 use super::joint::{Joint, LOCAL, PER_FIRE};
 use crate::alarm::Method;
 use crate::locate::{Fix, SHARED, Shared, Sighting, Terrain, View};
-use emberfix_frames::{
-    Coordinate, Covariance, Matrix3, Metres, MissionEnu, Vector3, Wgs84Parts,
-};
+use emberfix_frames::{Coordinate, Covariance, Matrix3, Metres, MissionEnu, Vector3, Wgs84Parts};
 use nalgebra::{SMatrix, SVector};
 use std::collections::BTreeSet;
 
@@ -65,8 +63,14 @@ impl Estimate {
         placed_by_shared.set_column(Shared::Disparity as usize, &Vector3::zeros());
         let mut by_shared = SMatrix::<f64, PER_FIRE, SHARED>::zeros();
         // The placed point is truth plus D n: the truth is the placed point minus D n.
-        by_shared.fixed_view_mut::<3, SHARED>(0, 0).copy_from(&-placed_by_shared);
-        joint.add(&State::new(point.x, point.y, point.z, 0.0), &by_shared, &own);
+        by_shared
+            .fixed_view_mut::<3, SHARED>(0, 0)
+            .copy_from(&-placed_by_shared);
+        joint.add(
+            &State::new(point.x, point.y, point.z, 0.0),
+            &by_shared,
+            &own,
+        );
         Some(Self {
             state: joint.fire(slot),
             covariance: joint.between(slot, slot),
@@ -208,7 +212,9 @@ impl Estimate {
         };
         m.residual[0] = sighting.base.u - predicted.pixel.u;
         m.residual[1] = sighting.base.v - predicted.pixel.v;
-        m.by_state.fixed_view_mut::<2, 3>(0, 0).copy_from(&predicted.by_position);
+        m.by_state
+            .fixed_view_mut::<2, 3>(0, 0)
+            .copy_from(&predicted.by_position);
         let by_shared = scaled(predicted.by_shared, view);
         m.by_shared.fixed_rows_mut::<2>(0).copy_from(&by_shared);
         m.noise[(0, 0)] = variance(sigma_u);
@@ -223,7 +229,12 @@ impl Estimate {
     }
 
     /// Disparity of the flame, which was measured above the base: by how much, the pixels say.
-    fn disparity(&self, sighting: &Sighting, view: &View<'_>, at: &State) -> Option<Measurement<1>> {
+    fn disparity(
+        &self,
+        sighting: &Sighting,
+        view: &View<'_>,
+        at: &State,
+    ) -> Option<Measurement<1>> {
         let measured = sighting.disparity?;
         let base = at.fixed_rows::<3>(0).into_owned();
         let ray = view.ray_enu(measured.centroid);
@@ -231,7 +242,9 @@ impl Estimate {
         let height = (above - base).dot(view.up());
         let predicted = view.predict(&(base + view.up() * height))?;
         let mut by_state = SMatrix::<f64, 1, PER_FIRE>::zeros();
-        by_state.fixed_view_mut::<1, 3>(0, 0).copy_from(&predicted.disparity_by_position);
+        by_state
+            .fixed_view_mut::<1, 3>(0, 0)
+            .copy_from(&predicted.disparity_by_position);
         Some(Measurement {
             residual: SVector::<f64, 1>::new(measured.px - predicted.disparity_px),
             by_state,
@@ -280,8 +293,12 @@ impl Estimate {
 
 fn by_local<const M: usize>(m: &Measurement<M>) -> SMatrix<f64, M, LOCAL> {
     let mut by_local = SMatrix::<f64, M, LOCAL>::zeros();
-    by_local.fixed_view_mut::<M, SHARED>(0, 0).copy_from(&m.by_shared);
-    by_local.fixed_view_mut::<M, PER_FIRE>(0, SHARED).copy_from(&m.by_state);
+    by_local
+        .fixed_view_mut::<M, SHARED>(0, 0)
+        .copy_from(&m.by_shared);
+    by_local
+        .fixed_view_mut::<M, PER_FIRE>(0, SHARED)
+        .copy_from(&m.by_state);
     by_local
 }
 

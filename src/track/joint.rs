@@ -32,7 +32,10 @@ pub struct Joint {
 
 impl Default for Joint {
     fn default() -> Self {
-        Self { mean: DVector::zeros(SHARED), covariance: DMatrix::identity(SHARED, SHARED) }
+        Self {
+            mean: DVector::zeros(SHARED),
+            covariance: DMatrix::identity(SHARED, SHARED),
+        }
     }
 }
 
@@ -61,10 +64,17 @@ impl Joint {
         let mean = at + by_shared * self.mean.rows(0, SHARED);
         self.mean.resize_vertically_mut(old + PER_FIRE, 0.0);
         self.mean.rows_mut(old, PER_FIRE).copy_from(&mean);
-        self.covariance.resize_mut(old + PER_FIRE, old + PER_FIRE, 0.0);
-        self.covariance.view_mut((old, 0), (PER_FIRE, old)).copy_from(&with_all);
-        self.covariance.view_mut((0, old), (old, PER_FIRE)).copy_from(&with_all.transpose());
-        self.covariance.view_mut((old, old), (PER_FIRE, PER_FIRE)).copy_from(&itself);
+        self.covariance
+            .resize_mut(old + PER_FIRE, old + PER_FIRE, 0.0);
+        self.covariance
+            .view_mut((old, 0), (PER_FIRE, old))
+            .copy_from(&with_all);
+        self.covariance
+            .view_mut((0, old), (old, PER_FIRE))
+            .copy_from(&with_all.transpose());
+        self.covariance
+            .view_mut((old, old), (PER_FIRE, PER_FIRE))
+            .copy_from(&itself);
     }
 
     /// Forgets the fire in a slot; later fires move up by one.
@@ -112,7 +122,9 @@ impl Joint {
     /// Covariance of the shared errors, sigmas squared.
     #[must_use]
     pub fn shared_covariance(&self) -> SMatrix<f64, SHARED, SHARED> {
-        self.covariance.fixed_view::<SHARED, SHARED>(0, 0).into_owned()
+        self.covariance
+            .fixed_view::<SHARED, SHARED>(0, 0)
+            .into_owned()
     }
 
     /// Mean of the fire in a slot.
@@ -124,18 +136,28 @@ impl Joint {
     /// Covariance between the fires in two slots (of one fire, when they are the same).
     #[must_use]
     pub fn between(&self, a: usize, b: usize) -> SMatrix<f64, PER_FIRE, PER_FIRE> {
-        self.covariance.fixed_view::<PER_FIRE, PER_FIRE>(offset(a), offset(b)).into_owned()
+        self.covariance
+            .fixed_view::<PER_FIRE, PER_FIRE>(offset(a), offset(b))
+            .into_owned()
     }
 
     /// Covariance of (shared errors, the fire in a slot).
     #[must_use]
     pub fn local(&self, slot: usize) -> SMatrix<f64, LOCAL, LOCAL> {
         let mut local = SMatrix::<f64, LOCAL, LOCAL>::zeros();
-        let with_shared =
-            self.covariance.fixed_view::<PER_FIRE, SHARED>(offset(slot), 0).into_owned();
-        local.fixed_view_mut::<SHARED, SHARED>(0, 0).copy_from(&self.shared_covariance());
-        local.fixed_view_mut::<PER_FIRE, SHARED>(SHARED, 0).copy_from(&with_shared);
-        local.fixed_view_mut::<SHARED, PER_FIRE>(0, SHARED).copy_from(&with_shared.transpose());
+        let with_shared = self
+            .covariance
+            .fixed_view::<PER_FIRE, SHARED>(offset(slot), 0)
+            .into_owned();
+        local
+            .fixed_view_mut::<SHARED, SHARED>(0, 0)
+            .copy_from(&self.shared_covariance());
+        local
+            .fixed_view_mut::<PER_FIRE, SHARED>(SHARED, 0)
+            .copy_from(&with_shared);
+        local
+            .fixed_view_mut::<SHARED, PER_FIRE>(0, SHARED)
+            .copy_from(&with_shared.transpose());
         local
             .fixed_view_mut::<PER_FIRE, PER_FIRE>(SHARED, SHARED)
             .copy_from(&self.between(slot, slot));

@@ -24,7 +24,11 @@ const REFUTED: f64 = -2.2;
 
 impl Default for Evidence {
     fn default() -> Self {
-        Self { log_odds: 0.0, hits: 0, highest: 0.0 }
+        Self {
+            log_odds: 0.0,
+            hits: 0,
+            highest: 0.0,
+        }
     }
 }
 

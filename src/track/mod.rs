@@ -196,9 +196,15 @@ impl Tracker {
             let fire = match assigned[index] {
                 Some(slot) => Some(self.update(slot, classified, view, terrain)),
                 None if self.explained(view, sightings, index, &assigned) => None,
-                None => own.as_ref().and_then(|own| self.initiate(classified, own, view, terrain)),
+                None => own
+                    .as_ref()
+                    .and_then(|own| self.initiate(classified, own, view, terrain)),
             };
-            outcomes.push(Outcome { index, fire, fix: own });
+            outcomes.push(Outcome {
+                index,
+                fire,
+                fix: own,
+            });
         }
         self.read_off();
         self.note_side_by_side(&outcomes);
@@ -210,7 +216,9 @@ impl Tracker {
 
     /// Lets time pass since the last frame.
     fn age(&mut self, now: ServiceTime) {
-        let dt_s = self.last_step.map_or(0.0, |last| (now - last).as_secs_f64());
+        let dt_s = self
+            .last_step
+            .map_or(0.0, |last| (now - last).as_secs_f64());
         self.last_step = Some(now);
         self.joint.age(dt_s, &self.config);
         self.read_off();
@@ -231,7 +239,9 @@ impl Tracker {
                 if fire.class != classified.class || fire.merged_into.is_some() {
                     continue;
                 }
-                if let Some(distance) = fire.estimate.distance(&classified.sighting, view, &self.joint, slot)
+                if let Some(distance) =
+                    fire.estimate
+                        .distance(&classified.sighting, view, &self.joint, slot)
                     && distance < GATE
                 {
                     pairs.push((distance, index, slot));
@@ -284,7 +294,8 @@ impl Tracker {
             .filter(|fire| fire.class == AlarmClass::Fire && fire.state != FireState::Out)
             .filter_map(|fire| view.predict(&fire.estimate.position_m()))
             .map(|predicted| (predicted.pixel.u, predicted.pixel.v));
-        seen.chain(known).any(|(u, v)| is_near_box(&smoke.sighting, u, v))
+        seen.chain(known)
+            .any(|(u, v)| is_near_box(&smoke.sighting, u, v))
     }
 
     fn update(
@@ -296,7 +307,8 @@ impl Tracker {
     ) -> FireId {
         let fire = &mut self.fires[slot];
         fire.estimate.read_off(&self.joint, slot);
-        fire.estimate.update(&classified.sighting, view, terrain, &mut self.joint, slot);
+        fire.estimate
+            .update(&classified.sighting, view, terrain, &mut self.joint, slot);
         fire.evidence.hit(classified.score);
         fire.last_seen = classified.sighting.at;
         note_extent(fire, &classified.sighting, view);
@@ -366,7 +378,11 @@ impl Tracker {
 
     fn note_misses(&mut self, view: &View<'_>, outcomes: &[Outcome]) {
         let seen: BTreeSet<FireId> = outcomes.iter().filter_map(|outcome| outcome.fire).collect();
-        for fire in self.fires.iter_mut().filter(|fire| !seen.contains(&fire.id)) {
+        for fire in self
+            .fires
+            .iter_mut()
+            .filter(|fire| !seen.contains(&fire.id))
+        {
             if should_be_seen(fire, view) {
                 fire.evidence.miss();
                 if fire.is_confirmed() && fire.evidence.is_refuted() {
@@ -407,8 +423,12 @@ impl Tracker {
         let extent_m = extent_m(&self.fires[a]).max(extent_m(&self.fires[b]));
         let extent = nalgebra::Matrix2::identity() * (0.25 * extent_m * extent_m);
         let spread = spread.fixed_view::<2, 2>(0, 0) + extent;
-        let apart = (joint.fire(a) - joint.fire(b)).fixed_rows::<2>(0).into_owned();
-        spread.cholesky().map_or(f64::INFINITY, |spread| apart.dot(&spread.solve(&apart)))
+        let apart = (joint.fire(a) - joint.fire(b))
+            .fixed_rows::<2>(0)
+            .into_owned();
+        spread
+            .cholesky()
+            .map_or(f64::INFINITY, |spread| apart.dot(&spread.solve(&apart)))
     }
 
     fn forget(&mut self, now: ServiceTime) {
@@ -417,8 +437,7 @@ impl Tracker {
             |fire: &Fire| fire.merged_into.is_some() && !fire.evidence.was_convincing();
         let over = |fire: &Fire| {
             let age_s = (now - fire.last_seen).as_secs_f64();
-            fire.state == FireState::Suspected
-                && (age_s > limit_s || fire.evidence.is_refuted())
+            fire.state == FireState::Suspected && (age_s > limit_s || fire.evidence.is_refuted())
         };
         for slot in (0..self.fires.len()).rev() {
             let fire = &self.fires[slot];
@@ -431,7 +450,11 @@ impl Tracker {
 
     /// Makes room: the suspected fire with the least evidence goes. `None` when all are confirmed.
     fn forget_weakest(&mut self) -> Option<()> {
-        let suspected = self.fires.iter().enumerate().filter(|(_, fire)| !fire.is_confirmed());
+        let suspected = self
+            .fires
+            .iter()
+            .enumerate()
+            .filter(|(_, fire)| !fire.is_confirmed());
         let probability = |fire: &Fire| fire.evidence.probability();
         let weakest = suspected.min_by(|a, b| probability(a.1).total_cmp(&probability(b.1)));
         let slot = weakest.map(|(slot, _)| slot)?;
@@ -484,7 +507,12 @@ fn contains(outer: &Sighting, inner: &Sighting) -> bool {
     };
     let middle = |s: &Sighting| s.base.v - s.size_px.1 / 2.0;
     let shared = overlap(outer.base.u, outer.size_px.0, inner.base.u, inner.size_px.0)
-        * overlap(middle(outer), outer.size_px.1, middle(inner), inner.size_px.1);
+        * overlap(
+            middle(outer),
+            outer.size_px.1,
+            middle(inner),
+            inner.size_px.1,
+        );
     shared > 0.5 * inner.size_px.0 * inner.size_px.1
 }
 

@@ -8,7 +8,10 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
-const SIGMAS: SharedSigmas = SharedSigmas { heading_rad: 0.03, tilt_rad: 0.006 };
+const SIGMAS: SharedSigmas = SharedSigmas {
+    heading_rad: 0.03,
+    tilt_rad: 0.006,
+};
 const DISPARITY_SIGMA_PX: f64 = 0.2;
 const BOX_SIGMA_PX: f64 = 2.0;
 
@@ -48,7 +51,13 @@ impl Flight {
             Path::StraightIn => Vector3::new(2.0, 30.0, -12.0),
             Path::Orbit => Vector3::new(5.0, -8.0, -60.0),
         };
-        Self { path, rig, fire, bias, dice }
+        Self {
+            path,
+            rig,
+            fire,
+            bias,
+            dice,
+        }
     }
 
     fn true_pose(&self, t_s: f64) -> Pose {
@@ -65,7 +74,10 @@ impl Flight {
         pose.velocity_enu_m_s = Vector3::new(azimuth.cos(), -azimuth.sin(), 0.0) * 9.0;
         pose.rate_rad_s = Vector3::new(0.0, 0.0, 9.0 / 80.0);
         pose.at = ServiceTime::from_unix_ns(0) + SignedDuration::from_millis((t_s * 1e3) as i64);
-        shift(&mut pose, Vector3::new(azimuth.sin(), azimuth.cos(), 0.0) * 80.0);
+        shift(
+            &mut pose,
+            Vector3::new(azimuth.sin(), azimuth.cos(), 0.0) * 80.0,
+        );
         pose
     }
 
@@ -88,8 +100,8 @@ impl Flight {
         let (roll, pitch, heading) = pose.attitude.angles();
         let jitter = Vector3::from_fn(|_, _| self.dice.normal(truth.attitude_noise_rad));
         let body = Vector3::new(b[4], b[5], b[6]) + jitter;
-        pose.attitude =
-            Attitude::from_angles(roll, pitch, heading + b[Shared::Heading as usize]).rotated(body, 1.0);
+        pose.attitude = Attitude::from_angles(roll, pitch, heading + b[Shared::Heading as usize])
+            .rotated(body, 1.0);
         pose
     }
 
@@ -124,7 +136,9 @@ impl Flight {
 
 fn shift(pose: &mut Pose, by: Vector3<f64>) {
     let point = Coordinate::<VehicleEnu>::from_metres(by);
-    pose.place = emberfix_frames::ecef_from_enu(&pose.place).transform(point).to_wgs84();
+    pose.place = emberfix_frames::ecef_from_enu(&pose.place)
+        .transform(point)
+        .to_wgs84();
 }
 
 fn fly(path: Path, seed: u64, sightings: usize) -> (Tracker, Vector3<f64>) {
@@ -153,7 +167,9 @@ fn consistency(path: Path, sightings: usize) -> (f64, f64) {
         let (tracker, truth) = fly(path, seed, sightings);
         assert_eq!(tracker.fires().len(), 1, "seed {seed}");
         let fire = &tracker.fires()[0];
-        let error = (fire.position().metres() - truth).fixed_rows::<2>(0).into_owned();
+        let error = (fire.position().metres() - truth)
+            .fixed_rows::<2>(0)
+            .into_owned();
         let spread = fire.covariance().m2().fixed_view::<2, 2>(0, 0).into_owned();
         let squared = error.dot(&(spread.try_inverse().unwrap() * error));
         nees += squared;
@@ -181,7 +197,10 @@ fn looking_longer_never_makes_a_constant_gnss_error_smaller() {
     let horizontal = fire.covariance().m2()[(0, 0)].sqrt();
     // 1.5 m per axis is the floor; the wander of 5 s at 100 s correlation is worth a few percent.
     assert!(horizontal > 1.45, "{horizontal}");
-    assert_eq!(fire.methods(), [Method::Stereo, Method::Parallax, Method::Terrain]);
+    assert_eq!(
+        fire.methods(),
+        [Method::Stereo, Method::Parallax, Method::Terrain]
+    );
     assert_eq!(fire.state, FireState::Confirmed);
 }
 
