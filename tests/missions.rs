@@ -1,10 +1,6 @@
 //! Every mission and rig that we ship loads; the ground's configuration too.
 
-#![expect(
-    clippy::unwrap_used,
-    clippy::panic,
-    reason = "a test may stop at its first surprise"
-)]
+#![expect(clippy::unwrap_used, reason = "a test may stop at its first surprise")]
 
 use emberfix::ground::{GroundConfig, Overrides};
 use emberfix::mission::Mission;

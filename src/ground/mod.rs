@@ -191,7 +191,7 @@ impl Ground {
         self.address
     }
 
-    /// Stops: open event streams end, open requests get [`GRACE`] to finish.
+    /// Stops: open event streams end, open requests get three seconds to finish.
     ///
     /// # Errors
     /// [`GroundError::Serve`] when the server had already failed.

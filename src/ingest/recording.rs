@@ -1,7 +1,7 @@
 //! A recording, finished or torn, in the order of its log times.
 //!
 //! The file is read twice: once to check every block and to index its messages, then message by
-//! message. Memory: 32 bytes a message, and [`CACHED_BLOCKS`] unpacked blocks. What is whole is used;
+//! message. Memory: 32 bytes a message, and a few unpacked blocks. What is whole is used;
 //! what is not is counted, and known when the recording is opened.
 
 use super::blocks::{Block, BlockReader, Dictionary, RawMessage};

@@ -1,7 +1,7 @@
 //! One sighting to one fix: camera to body to ENU to ECEF to latitude, longitude, height.
 //!
 //! **In:** a [`Sighting`] (pixels of the rectified left image, disparity if stereo gave one), the
-//! [`Pose`] at its mid-exposure, the rig, the terrain. **Out:** a [`Fix`] with its covariance in
+//! [`Pose`](crate::pose::Pose) at its mid-exposure, the rig, the terrain. **Out:** a [`Fix`] with its covariance in
 //! the tangent plane at the mission datum. Pure: no I/O, no clock.
 //!
 //! **Assumptions.** A flame stands upright above its base; the lower edge of the box is where it

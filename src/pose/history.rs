@@ -3,7 +3,7 @@
 use emberfix_frames::{BootTime, SignedDuration};
 use std::collections::VecDeque;
 
-/// The last samples, ordered by boot time. Bound: [`CAPACITY`]; the oldest go first. A sample that
+/// The last samples, ordered by boot time. Bound: 1000; the oldest go first. A sample that
 /// comes late is sorted in; one that is older than all that is kept is dropped.
 #[derive(Debug, Clone)]
 pub struct History<T> {

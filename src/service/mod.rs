@@ -11,7 +11,7 @@
 //! link hears of them.
 //!
 //! **Health.** The heartbeat is sent only while the pipeline thread takes events in and its own
-//! health report is clean; see [`Board::is_healthy`].
+//! health report is clean.
 
 mod camera;
 mod core;
