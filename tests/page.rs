@@ -1,10 +1,7 @@
 //! A real browser sees the fire on the ground station's page: the real `emberfix ground`, an alarm
 //! over HTTP, Chromium. Exit code 77 of the client means that there is no browser here.
 
-#![expect(
-    clippy::unwrap_used,
-    reason = "a test may stop at its first surprise"
-)]
+#![expect(clippy::unwrap_used, reason = "a test may stop at its first surprise")]
 
 #[path = "support/clients.rs"]
 mod clients;
@@ -38,13 +35,22 @@ fn a_browser_sees_the_fire_and_asks_no_other_server() {
     let mut ground = Command::new(env!("CARGO_BIN_EXE_emberfix"));
     ground.arg("ground").arg(&config);
     let (ground, line) = Running::start(ground, "http://");
-    let url = line.split_whitespace().find(|word| word.starts_with("http://")).unwrap();
+    let url = line
+        .split_whitespace()
+        .find(|word| word.starts_with("http://"))
+        .unwrap();
 
     let alarm = Alarm::from_geojson(FIRE.as_bytes()).unwrap();
     HttpLink::new(url).unwrap().send_alarm(&alarm).unwrap();
 
     let mut browser = clients.client("browser_check.py");
-    browser.args([url, "--expect", "uav-1-7", "--expect", "31.409422, 119.112017"]);
+    browser.args([
+        url,
+        "--expect",
+        "uav-1-7",
+        "--expect",
+        "31.409422, 119.112017",
+    ]);
     let said = Said::of(&browser.output().unwrap());
     drop(ground);
     if said.code == 77 {

@@ -211,7 +211,10 @@ impl Demo<'_> {
             mission: self.mission.name.clone(),
             seed: self.mission.sim.seed,
             errors_off: self.errors.off,
-            figures: score.figures(ErrorBound::for_errors(self.errors.off)),
+            figures: score.figures(ErrorBound::for_errors(
+                self.errors.off,
+                self.mission.sim.horizontal_error_bound_m,
+            )),
             score,
             page: ground.url.clone(),
             pairs: PairCounts {

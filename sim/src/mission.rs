@@ -76,6 +76,9 @@ pub struct Mission {
 pub struct SimConfig {
     /// Seed of everything random.
     pub seed: u64,
+    /// Greatest mean horizontal error that the demo accepts with the mission's sensor errors, metres.
+    #[serde(default)]
+    pub horizontal_error_bound_m: Option<f64>,
     /// When a recorded flight begins, RFC 3339.
     pub start_utc: String,
     /// The way.

@@ -235,16 +235,17 @@ pub struct Figure {
 /// Greatest mean horizontal error, metres.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ErrorBound {
-    /// The bound, metres.
-    pub horizontal_mean_m: f64,
+    /// The bound, metres; a flight whose GNSS draw may be anything has none.
+    pub horizontal_mean_m: Option<f64>,
 }
 
 impl ErrorBound {
-    /// With the mission's sensor errors (consumer GNSS), or with all sensors exact.
+    /// With the mission's sensor errors (its own bound, if it states one), or with all sensors
+    /// exact.
     #[must_use]
-    pub fn for_errors(off: bool) -> Self {
+    pub fn for_errors(off: bool, with_errors_m: Option<f64>) -> Self {
         Self {
-            horizontal_mean_m: if off { 0.5 } else { 3.0 },
+            horizontal_mean_m: if off { Some(0.5) } else { with_errors_m },
         }
     }
 }
@@ -403,8 +404,8 @@ impl Score {
                 "demo.horizontal_error_mean_m",
                 errors,
                 "m",
-                Some(limit),
-                errors.is_some_and(|error| error <= limit),
+                limit,
+                errors.is_some_and(|error| limit.is_none_or(|limit| error <= limit)),
                 found.len(),
             ),
             figure(
@@ -450,7 +451,7 @@ mod tests {
     }
 
     fn value(score: &Score, name: &str) -> (Option<f64>, bool) {
-        let figures = score.figures(ErrorBound::for_errors(false));
+        let figures = score.figures(ErrorBound::for_errors(false, Some(3.0)));
         let figure = figures.iter().find(|figure| figure.name == name).unwrap();
         (figure.value, figure.holds)
     }
@@ -473,13 +474,13 @@ mod tests {
         );
         assert!(
             score
-                .figures(ErrorBound::for_errors(false))
+                .figures(ErrorBound::for_errors(false, Some(3.0)))
                 .iter()
                 .all(|figure| figure.holds)
         );
         assert!(
             !score
-                .figures(ErrorBound::for_errors(true))
+                .figures(ErrorBound::for_errors(true, Some(3.0)))
                 .iter()
                 .all(|figure| figure.holds)
         );

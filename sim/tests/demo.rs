@@ -2,10 +2,7 @@
 //! sockets. Needs the `emberfix` binary beside the simulator's, which a test run of the whole
 //! workspace builds, and ONNX Runtime.
 
-#![expect(
-    clippy::unwrap_used,
-    reason = "a test may stop at its first surprise"
-)]
+#![expect(clippy::unwrap_used, reason = "a test may stop at its first surprise")]
 
 use serde_json::Value;
 use std::path::Path;
@@ -29,10 +26,19 @@ fn a_flight_becomes_an_alarm_at_the_place_of_the_fire() {
     demo.args(["demo", "gaochun", "--errors", "off", "--headless", "--json"]);
     let said = demo.current_dir(root).output().unwrap();
     let words = String::from_utf8_lossy(&said.stderr);
-    let report: Value = serde_json::from_slice(&said.stdout)
-        .unwrap_or_else(|error| panic!("{error}: {words}"));
-    assert!((figure(&report, "demo.fires_found") - 1.0).abs() < 0.5, "{report:#}");
+    let report: Value =
+        serde_json::from_slice(&said.stdout).unwrap_or_else(|error| panic!("{error}: {words}"));
+    assert!(
+        (figure(&report, "demo.fires_found") - 1.0).abs() < 0.5,
+        "{report:#}"
+    );
     // The bound of the issue for exact sensors; GNSS alone is allowed 3 m.
-    assert!(figure(&report, "demo.horizontal_error_mean_m") <= 0.5, "{report:#}");
-    assert!(report["service_heartbeats"].as_u64().unwrap() > 10, "{report:#}");
+    assert!(
+        figure(&report, "demo.horizontal_error_mean_m") <= 0.5,
+        "{report:#}"
+    );
+    assert!(
+        report["service_heartbeats"].as_u64().unwrap() > 10,
+        "{report:#}"
+    );
 }

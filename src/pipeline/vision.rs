@@ -37,9 +37,10 @@ pub struct Vision {
 
 /// Margin about a box for its light, as a share of the box: box edges jitter, light must not.
 const GLOW_MARGIN: f64 = 0.25;
-/// Jitter of a box's edges: pixels at least, and as a share of the box.
+/// Jitter of a box's edges: pixels at least, and as a share of the box. A bed of embers has a radius of a
+/// third of the flame's width, and from above its near rim is the lower edge.
 const EDGE_PX: f64 = 2.0;
-const EDGE_SHARE: f64 = 0.1;
+const EDGE_SHARE: f64 = 0.2;
 
 impl Vision {
     /// For one rig.

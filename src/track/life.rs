@@ -13,7 +13,7 @@ pub struct Evidence {
 const HIT: f64 = 0.6;
 const HIT_PER_SCORE: f64 = 1.4;
 /// What a look without a sighting takes: ln(0.25 / 0.9) = -1.3, less because misses come in runs.
-const MISS: f64 = -0.5;
+const MISS: f64 = -0.8;
 /// Bounds: no amount of old evidence outweighs a long run of new looks.
 const LOWEST: f64 = -3.0;
 const HIGHEST: f64 = 6.0;

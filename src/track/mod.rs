@@ -58,7 +58,7 @@ pub struct TrackConfig {
 impl Default for TrackConfig {
     fn default() -> Self {
         Self {
-            confirm_sightings: 4,
+            confirm_sightings: 8,
             confirm_span_s: 1.0,
             gnss_correlation_s: 100.0,
             heading_correlation_s: 300.0,
