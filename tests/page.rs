@@ -4,7 +4,10 @@
 #![expect(clippy::unwrap_used, reason = "a test may stop at its first surprise")]
 
 #[path = "support/clients.rs"]
-#[expect(dead_code, reason = "the browser is run to its end, and states no facts")]
+#[expect(
+    dead_code,
+    reason = "the browser is run to its end, and states no facts"
+)]
 mod clients;
 #[expect(dead_code, reason = "no mission is flown here")]
 mod support;
