@@ -118,7 +118,7 @@ pub async fn run(config: &Path, overrides: Overrides) -> Result<(), GroundError>
     let data_dir = config.data_dir.clone();
     let ground = Ground::start(config).await?;
     // The line that people and programs wait for; with port 0 only it knows the port.
-    println!(
+    eprintln!(
         "emberfix ground: http://{} keeps alarms in {}",
         ground.address(),
         data_dir.display()
