@@ -36,7 +36,7 @@ pub enum DemoError {
         source: std::io::Error,
     },
     /// A program could not be started.
-    #[error("{program}: {source}; build it with ./x build", program = program.display())]
+    #[error("{program}: {source}; ./x demo builds it", program = program.display())]
     Start {
         /// The program.
         program: PathBuf,
