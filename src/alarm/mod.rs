@@ -241,7 +241,8 @@ fn check_properties(properties: &AlarmProperties) -> Result<(), AlarmError> {
     Ok(())
 }
 
-mod rfc3339 {
+/// Serialises a [`ServiceTime`] as RFC 3339 text.
+pub(crate) mod rfc3339 {
     use emberfix_frames::ServiceTime;
     use serde::{Deserialize, Deserializer, Serializer, de::Error};
 

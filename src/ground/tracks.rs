@@ -20,7 +20,7 @@ pub struct Ping {
     /// Name of the aircraft, 1 to 32 characters.
     pub uav: String,
     /// When; UTC, RFC 3339.
-    #[serde(with = "crate::ground::tracks::rfc3339")]
+    #[serde(with = "crate::alarm::rfc3339")]
     pub at: ServiceTime,
     /// Degrees, north positive.
     pub latitude_deg: f64,
@@ -210,22 +210,6 @@ impl Track {
             "geometry": geometry,
             "properties": self.latest,
         })
-    }
-}
-
-pub(super) mod rfc3339 {
-    use emberfix_frames::ServiceTime;
-    use serde::{Deserialize, Deserializer, Serializer, de::Error};
-
-    pub fn serialize<S: Serializer>(at: &ServiceTime, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.serialize_str(&at.rfc3339())
-    }
-    pub fn deserialize<'de, D: Deserializer<'de>>(
-        deserializer: D,
-    ) -> Result<ServiceTime, D::Error> {
-        let text = String::deserialize(deserializer)?;
-        ServiceTime::from_rfc3339(&text)
-            .ok_or_else(|| D::Error::custom(format!("{text:?} is no RFC 3339 time")))
     }
 }
 
