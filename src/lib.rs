@@ -7,13 +7,15 @@
 //! Absences, which a test checks:
 //! - `locate`, `track`, `alarm`, `assess` do no I/O and read no clock; time and seeds are arguments.
 //! - `detect` is the only user of ONNX Runtime, `range` the only stereo use of OpenCV.
-//! - Nothing here knows the simulator: it reaches the service as a stranger would.
+//! - Nothing that flies knows the simulator, which reaches the service as a stranger would; [`eval`]
+//!   alone uses its world, as truth to measure against.
 
 pub mod alarm;
 pub mod assess;
 pub mod cli;
 pub mod deliver;
 pub mod detect;
+pub mod eval;
 pub mod ground;
 pub mod ingest;
 pub mod locate;

@@ -97,8 +97,29 @@ fn only_frames_asserts_frame_relations() {
 }
 
 #[test]
-fn the_service_does_not_know_the_simulator_and_mav_does_not_know_fire() {
-    assert_absent("src", &["emberfix_sim"]);
+fn only_eval_knows_the_simulator_and_mav_does_not_know_fire() {
+    for (path, text) in rust_files("src") {
+        let measures = ["src/eval", "src/cli/eval"];
+        if !measures
+            .iter()
+            .any(|room| path.starts_with(root().join(room)))
+        {
+            assert_eq!(
+                lines_with(&text, "emberfix_sim").count(),
+                0,
+                "{}",
+                path.display()
+            );
+        }
+        if !path.starts_with(root().join("src/cli")) && !path.starts_with(root().join("src/eval")) {
+            assert_eq!(
+                lines_with(&text, "crate::eval").count(),
+                0,
+                "{}",
+                path.display()
+            );
+        }
+    }
     assert_absent("mav/src", &["fire", "Fire"]);
     assert_absent("sim/src", &["emberfix::"]);
 }

@@ -10,9 +10,10 @@ use crate::earth::TangentPlane;
 use crate::flight::Flight;
 use crate::live::{Control, Edges, HeadStart, LiveError, LiveFlight};
 use crate::mission::Mission;
-use crate::score::{self, AlarmsError, ErrorBound, Figure, Score};
+use crate::score::{self, AlarmsError, ErrorBound, Score};
 use crate::world::World;
 use emberfix_frames::ServiceTime;
+use emberfix_report::Figure;
 use rustix::process::{Pid, Signal, kill_process};
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -567,25 +568,10 @@ impl Report {
                 alarm.alarm, alarm.east_m, alarm.north_m
             ));
         }
-        for figure in &self.figures {
-            text.push_str(&figure_line(figure));
-        }
+        text.push('\n');
+        text.push_str(&emberfix_report::text_lines(&self.figures));
         text
     }
-}
-
-fn figure_line(figure: &Figure) -> String {
-    let value = figure
-        .value
-        .map_or("none".to_owned(), |value| format!("{value:.2}"));
-    let bound = figure
-        .bound
-        .map_or(String::new(), |bound| format!(", bound {bound}"));
-    let verdict = if figure.holds { "" } else { "  DOES NOT HOLD" };
-    format!(
-        "\n{:32} {value} {}{bound} (n = {}){verdict}",
-        figure.name, figure.unit, figure.n
-    )
 }
 
 fn cells(row: &score::Row) -> Vec<String> {

@@ -9,6 +9,7 @@
 
 use crate::earth::{Lla, TangentPlane};
 use emberfix_frames::{Matrix3, ServiceTime, Vector3};
+use emberfix_report::{Bound, Figure};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -215,23 +216,6 @@ pub struct FalseAlarm {
     pub north_m: f64,
 }
 
-/// One measured number and the bound that it must hold.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Figure {
-    /// Its name.
-    pub name: &'static str,
-    /// What was measured; null when nothing was.
-    pub value: Option<f64>,
-    /// Its unit.
-    pub unit: &'static str,
-    /// What it must keep to; null when nobody set one.
-    pub bound: Option<f64>,
-    /// Whether it does.
-    pub holds: bool,
-    /// How many samples it rests on.
-    pub n: usize,
-}
-
 /// Greatest mean horizontal error, metres.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ErrorBound {
@@ -365,55 +349,38 @@ impl Score {
             .filter_map(|f| f.first_sight_to_alarm_s)
             .collect();
         let count = |number: usize| Some(number as f64);
-        let figure = |name, value, unit, bound, holds, n| Figure {
-            name,
-            value,
-            unit,
-            bound,
-            holds,
-            n,
-        };
-        let limit = bound.horizontal_mean_m;
         let false_count = self.false_alarms.len();
-        vec![
-            figure(
-                "demo.fires_true",
-                count(fires.len()),
-                "fires",
-                None,
-                true,
-                fires.len(),
-            ),
-            figure(
-                "demo.fires_found",
-                count(found.len()),
-                "fires",
-                count(fires.len()),
-                found.len() == fires.len(),
-                fires.len(),
-            ),
-            figure(
-                "demo.false_alarms",
-                count(false_count),
-                "alarms",
-                Some(0.0),
-                false_count == 0,
-                found.len() + false_count,
-            ),
-            figure(
+        let error = match bound.horizontal_mean_m {
+            Some(limit) => Figure::bounded(
                 "demo.horizontal_error_mean_m",
                 errors,
                 "m",
-                limit,
-                errors.is_some_and(|error| limit.is_none_or(|limit| error <= limit)),
+                Bound::AtMost(limit),
                 found.len(),
             ),
-            figure(
+            None => Figure::told("demo.horizontal_error_mean_m", errors, "m", found.len()),
+        };
+        vec![
+            Figure::told("demo.fires_true", count(fires.len()), "fires", fires.len()),
+            Figure::bounded(
+                "demo.fires_found",
+                count(found.len()),
+                "fires",
+                Bound::Equals(fires.len() as f64),
+                fires.len(),
+            ),
+            Figure::bounded(
+                "demo.false_alarms",
+                count(false_count),
+                "alarms",
+                Bound::AtMost(0.0),
+                found.len() + false_count,
+            ),
+            error,
+            Figure::told(
                 "demo.first_sight_to_alarm_s",
                 mean(delays.iter().copied()),
                 "s",
-                None,
-                true,
                 delays.len(),
             ),
         ]

@@ -3,6 +3,9 @@
 //! Exit codes: 0 done, 1 failed while running, 2 refused (arguments, configuration, model,
 //! calibration, recording). What went wrong is one line on standard error that says what to do.
 
+mod calibrate;
+mod doctor;
+mod eval;
 mod replay;
 mod run;
 
@@ -29,6 +32,14 @@ enum Command {
     Replay(replay::ReplayArguments),
     /// Runs the ground station: receives, keeps and shows alarms.
     Ground(GroundArguments),
+    /// Checks everything before take-off: a table of pass, warn, fail, with remedies.
+    Doctor(doctor::DoctorArguments),
+    /// Calibrates a rig, or brings one in from another program's file.
+    #[command(subcommand)]
+    Calibrate(calibrate::Calibrate),
+    /// Measures the service against truth.
+    #[command(subcommand)]
+    Eval(eval::Eval),
 }
 
 #[derive(Debug, clap::Args)]
@@ -79,6 +90,9 @@ pub fn main() -> ExitCode {
         Command::Run(arguments) => run::run(arguments),
         Command::Replay(arguments) => replay::replay(&arguments),
         Command::Ground(arguments) => ground(arguments),
+        Command::Doctor(arguments) => doctor::doctor(&arguments),
+        Command::Calibrate(what) => calibrate::calibrate(&what),
+        Command::Eval(what) => eval::eval(&what),
     };
     match done {
         Ok(()) => ExitCode::SUCCESS,
