@@ -4,7 +4,7 @@
 //! mission file. The `[sim]` table belongs to the simulator and is not read here.
 
 use crate::detect::{DetectorConfig, Family};
-use crate::locate::{ConstantPlane, SharedSigmas, Terrain};
+use crate::locate::{SharedSigmas, Terrain};
 use crate::pose::PoseConfig;
 use crate::range::SgbmConfig;
 use crate::track::TrackConfig;
@@ -13,6 +13,8 @@ use emberfix_frames::{EllipsoidHeight, Wgs84, place_from_degrees};
 use serde::Deserialize;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+
+mod terrain;
 
 /// Why a mission file was refused.
 #[derive(Debug, thiserror::Error)]
@@ -109,7 +111,7 @@ struct RawMission {
     model: RawModel,
     #[serde(default)]
     range: RawRange,
-    terrain: Option<RawTerrain>,
+    terrain: Option<terrain::RawTerrain>,
     #[serde(default)]
     sigma: RawSigma,
     #[serde(default)]
@@ -155,13 +157,6 @@ struct RawModel {
 struct RawRange {
     max_disparity_px: Option<u32>,
     max_sigma_over_range: Option<f64>,
-}
-
-#[derive(Deserialize)]
-struct RawTerrain {
-    kind: String,
-    height_ellipsoid_m: f64,
-    sigma_m: f64,
 }
 
 #[derive(Deserialize)]
@@ -256,6 +251,11 @@ const KNOWN: &[&str] = &[
     "terrain.kind",
     "terrain.height_ellipsoid_m",
     "terrain.sigma_m",
+    "terrain.paths",
+    "terrain.vertical_datum",
+    "terrain.horizontal_sigma_m",
+    "terrain.canopy_m",
+    "terrain.reach_m",
     "sigma.gnss_horizontal_m",
     "sigma.gnss_vertical_m",
     "sigma.gnss_floor_m",
@@ -354,26 +354,7 @@ fn check(raw: &RawMission) -> Vec<String> {
     );
     check_numbers(&mut checks, raw);
     if let Some(terrain) = &raw.terrain {
-        if terrain.kind != "plane" {
-            checks.problem(format!(
-                "terrain.kind is {:?}, allowed is \"plane\"",
-                terrain.kind
-            ));
-        }
-        checks.range(
-            "terrain.height_ellipsoid_m",
-            terrain.height_ellipsoid_m,
-            -500.0,
-            9000.0,
-            "",
-        );
-        checks.range(
-            "terrain.sigma_m",
-            terrain.sigma_m,
-            0.05,
-            500.0,
-            " (never perfectly flat)",
-        );
+        terrain.check(&mut checks);
     }
     check_sigma(&mut checks, &raw.sigma);
     checks.range(
@@ -469,13 +450,15 @@ fn build(raw: RawMission, path: &Path) -> Result<Mission, MissionError> {
         path: path.to_owned(),
         problems: vec![format!("datum: {error}")],
     })?;
-    let terrain = raw.terrain.as_ref().map(|plane| -> Arc<dyn Terrain> {
-        let height = EllipsoidHeight::from_m(plane.height_ellipsoid_m);
-        Arc::new(ConstantPlane {
-            height,
-            sigma_m: plane.sigma_m,
-        })
-    });
+    let terrain = raw
+        .terrain
+        .as_ref()
+        .map(|terrain| terrain.build(&datum, &beside))
+        .transpose()
+        .map_err(|problems| MissionError::Values {
+            path: path.to_owned(),
+            problems,
+        })?;
     let state_dir = raw
         .state
         .dir

@@ -12,7 +12,10 @@ mod geometry;
 mod terrain;
 
 pub use geometry::{SHARED, Shared, SharedSigmas, View};
-pub use terrain::{ConstantPlane, Terrain, TerrainHit, meet_terrain};
+pub use terrain::{
+    Area, ConstantPlane, Coverage, Ground, Terrain, TerrainHit, Tile, TileError, TileParts,
+    TileSigmas, Tiles, VerticalDatum, meet_terrain,
+};
 
 use crate::alarm::Method;
 use emberfix_calib::RectifiedPixel;
@@ -80,7 +83,7 @@ pub fn fix(sighting: &Sighting, view: &View<'_>, terrain: Option<&dyn Terrain>) 
         .and_then(|d| stereo_range(sighting, &d, view));
     let on_ground = terrain.and_then(|t| match meet_terrain(&view.camera_enu, &ray, t, view) {
         TerrainHit::Met { range_m, sigma_m } => Some((range_m, sigma_m)),
-        TerrainHit::Above | TerrainHit::Grazing | TerrainHit::Unknown => None,
+        _ => None,
     });
     let on_ground = on_ground.filter(|(range, _)| {
         sighting
