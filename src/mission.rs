@@ -6,7 +6,7 @@
 use crate::detect::{DetectorConfig, Family};
 use crate::locate::{SharedSigmas, Terrain};
 use crate::pose::PoseConfig;
-use crate::range::SgbmConfig;
+use crate::range::{HsvMask, Method, RangeConfig};
 use crate::track::TrackConfig;
 use emberfix_calib::{Checks, KeyProblem, Rig, RigError, toml_problem, unknown_keys};
 use emberfix_frames::{EllipsoidHeight, Wgs84, place_from_degrees};
@@ -73,8 +73,10 @@ pub struct Mission {
     pub camera_url: String,
     /// The detector.
     pub detector: DetectorConfig,
-    /// Stereo matching.
-    pub range: SgbmConfig,
+    /// How ranges are measured.
+    pub range_method: Method,
+    /// Numbers of ranging.
+    pub range: RangeConfig,
     /// The ground, if the mission knows it.
     pub terrain: Option<Arc<dyn Terrain>>,
     /// Defaults and limits of the pose.
@@ -155,6 +157,8 @@ struct RawModel {
 
 #[derive(Deserialize, Default)]
 struct RawRange {
+    method: Option<String>,
+    mask: Option<String>,
     max_disparity_px: Option<u32>,
     max_sigma_over_range: Option<f64>,
 }
@@ -246,8 +250,10 @@ const KNOWN: &[&str] = &[
     "model.tile_px",
     "model.overlap_px",
     "model.threads",
+    "range.mask",
     "range.max_disparity_px",
     "range.max_sigma_over_range",
+    "range.method",
     "terrain.kind",
     "terrain.height_ellipsoid_m",
     "terrain.sigma_m",
@@ -393,6 +399,7 @@ fn check_numbers(checks: &mut Checks, raw: &RawMission) {
         let problem = problem.replace("num_disparities", "max_disparity_px");
         checks.problem(format!("range.{problem}"));
     }
+    check_range_names(checks, &raw.range);
 }
 
 fn check_sigma(checks: &mut Checks, sigma: &RawSigma) {
@@ -466,6 +473,7 @@ fn build(raw: RawMission, path: &Path) -> Result<Mission, MissionError> {
         .map_or_else(|| Path::new(".emberfix").join(&raw.name), beside);
     Ok(Mission {
         detector: detector(&raw.model, &beside),
+        range_method: method(&raw.range).unwrap_or_default(),
         range: range(&raw.range),
         pose: PoseConfig {
             gnss_horizontal_m: raw.sigma.gnss_horizontal_m,
@@ -520,9 +528,40 @@ fn detector(raw: &RawModel, beside: &dyn Fn(&Path) -> PathBuf) -> DetectorConfig
     }
 }
 
-fn range(raw: &RawRange) -> SgbmConfig {
-    let usual = SgbmConfig::default();
-    SgbmConfig {
+/// Methods and masks are named, not numbered.
+fn check_range_names(checks: &mut Checks, raw: &RawRange) {
+    let methods = Method::ALL.map(Method::name).join(", ");
+    for (key, named, known, allowed) in [
+        (
+            "method",
+            &raw.method,
+            method(raw).is_some(),
+            methods.as_str(),
+        ),
+        ("mask", &raw.mask, mask(raw).is_some(), "flame, printed"),
+    ] {
+        if let (Some(name), false) = (named, known) {
+            checks.problem(format!("range.{key} is {name:?}, allowed are {allowed}"));
+        }
+    }
+}
+
+fn method(raw: &RawRange) -> Option<Method> {
+    raw.method.as_deref().and_then(Method::from_name)
+}
+
+fn mask(raw: &RawRange) -> Option<HsvMask> {
+    match raw.mask.as_deref()? {
+        "flame" => Some(HsvMask::flame()),
+        "printed" => Some(HsvMask::printed()),
+        _ => None,
+    }
+}
+
+fn range(raw: &RawRange) -> RangeConfig {
+    let usual = RangeConfig::default();
+    RangeConfig {
+        mask: mask(raw).unwrap_or(usual.mask),
         num_disparities: raw.max_disparity_px.unwrap_or(usual.num_disparities),
         max_sigma_over_range: raw
             .max_sigma_over_range
