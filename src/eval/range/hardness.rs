@@ -1,7 +1,7 @@
 //! What each method does with flames that are hard to range.
 
 use super::cases::Hardness;
-use super::outcome::{BEST, Bench, NAMES, PAPER, Round, Verdict};
+use super::outcome::{BEST, Bench, FULL_FRAME, NAMES, Round, Verdict};
 use super::stage::{RigName, Stage};
 use super::tables::rounds;
 use super::{Options, RangeEvalError, Tick};
@@ -86,14 +86,18 @@ impl Suite {
         (of > 0).then(|| 100.0 * (1.0 - phantoms as f64 / of as f64))
     }
 
-    /// The same among the rounds in which matching as the papers ran it does call one.
+    /// The same among the rounds in which some reading of the whole frame matched does call one.
     pub(super) fn lures_rejected_percent(&self) -> (Option<f64>, usize) {
         let phantom =
             |round: &Round, method: usize| round.said[method].verdict == Verdict::PhantomNear;
         let lured: Vec<&Round> = self
             .rounds
             .iter()
-            .filter(|round| phantom(round, PAPER) || phantom(round, PAPER + 1))
+            .filter(|round| {
+                FULL_FRAME
+                    .into_iter()
+                    .any(|reading| phantom(round, reading))
+            })
             .collect();
         let fell = lured.iter().filter(|round| phantom(round, BEST)).count();
         let share = (!lured.is_empty()).then(|| 100.0 * (1.0 - fell as f64 / lured.len() as f64));
@@ -101,31 +105,28 @@ impl Suite {
     }
 }
 
-/// The table for people.
+/// The table for people: how many right / refused / phantom near / other wrong.
 pub(super) fn drawn(suites: &[Suite]) -> Table {
-    let header = [
-        "case",
-        "method",
-        "rounds",
-        "right",
-        "refused",
-        "phantom near",
-        "other wrong",
-    ];
-    let row = |count: Count| {
-        vec![
-            count.case.name().to_owned(),
-            count.method.to_owned(),
-            count.of.to_string(),
-            count.right.to_string(),
-            count.refused.to_string(),
-            count.phantom_near.to_string(),
-            count.other_wrong.to_string(),
-        ]
+    let mut header = vec!["case".to_owned(), "rounds".to_owned()];
+    header.extend(NAMES.map(str::to_owned));
+    let row = |suite: &Suite| {
+        let mut row = vec![suite.case.name().to_owned(), suite.rounds.len().to_string()];
+        row.extend(suite.counts().iter().map(|count| {
+            let Count {
+                right,
+                refused,
+                phantom_near,
+                other_wrong,
+                ..
+            } = count;
+            format!("{right} / {refused} / {phantom_near} / {other_wrong}")
+        }));
+        row
     };
     Table {
-        title: "Hard flames, 75 and 120 mm (right: within 3 of its own sigmas)".to_owned(),
-        header: header.map(str::to_owned).to_vec(),
-        rows: suites.iter().flat_map(Suite::counts).map(row).collect(),
+        title: "Hard flames, 75 and 120 mm: right within 3 sigma / refused / phantom near / other wrong"
+            .to_owned(),
+        header,
+        rows: suites.iter().map(row).collect(),
     }
 }

@@ -8,7 +8,7 @@ use emberfix_calib::{Eye, RectifiedPixel};
 use std::sync::Mutex;
 
 /// Who measures: our methods, and the papers' two readings of full-frame matching.
-pub(super) const NAMES: [&str; 7] = [
+pub(super) const NAMES: [&str; 8] = [
     "sgbm",
     "centroid",
     "correlate",
@@ -16,11 +16,12 @@ pub(super) const NAMES: [&str; 7] = [
     "best",
     "full-frame SGBM, P3's mask",
     "full-frame SGBM, P4's pixel",
+    "full-frame SGBM, our mask",
 ];
 /// The default's place among the names.
 pub(super) const BEST: usize = 4;
-/// P3's.
-pub(super) const PAPER: usize = 5;
+/// Readings of the whole frame matched.
+pub(super) const FULL_FRAME: std::ops::Range<usize> = 5..8;
 /// Our methods.
 pub(super) const OURS: usize = 5;
 /// Sigma that a reading is taken to have whose method states none.
@@ -120,7 +121,7 @@ impl<'a> Bench<'a> {
             said.push(self.judge(&ranging, &trial.truth));
         }
         let reading = set.papers.read(&trial.pair, &trial.target.box_px)?;
-        for disparity in [reading.masked_px, reading.single_px] {
+        for disparity in [reading.masked_px, reading.single_px, reading.median_px] {
             let truth_px = trial.truth.disparity_px(reading.row);
             let disparity = disparity.map(|px| (px, UNSTATED_SIGMA_PX));
             said.push(Said::new(

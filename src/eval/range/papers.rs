@@ -6,6 +6,7 @@
 //! times are taken over the whole frame.
 
 use super::RangeEvalError;
+use super::stats::{mean, median};
 use crate::detect::BoxPx;
 use crate::range::{HsvMask, RawPair};
 use emberfix_calib::{Eye, RawPixel, Rig};
@@ -30,6 +31,8 @@ pub(super) struct Reading {
     pub masked_px: Option<f64>,
     /// P4: the disparity at the middle of the box.
     pub single_px: Option<f64>,
+    /// Better than either printed: the median of the valid disparities under our own mask.
+    pub median_px: Option<f64>,
     /// Row of the box's middle in the raw left image.
     pub row: f64,
 }
@@ -80,6 +83,7 @@ impl FullFrame {
         let nothing = Reading {
             masked_px: None,
             single_px: None,
+            median_px: None,
             row,
         };
         let Some(target) = self.rectified(box_px)? else {
@@ -91,7 +95,13 @@ impl FullFrame {
         };
         let inside = target - part.tl();
         Ok(Reading {
-            masked_px: masked_mean(&disparities, &left_bgr, inside)?,
+            masked_px: mean(&masked(
+                &disparities,
+                &left_bgr,
+                inside,
+                &HsvMask::printed(),
+            )?),
+            median_px: median(&masked(&disparities, &left_bgr, inside, &HsvMask::flame())?),
             single_px: at(
                 &disparities,
                 inside.x + inside.width / 2,
@@ -168,18 +178,21 @@ fn at(disparities: &Mat, column: i32, row: i32) -> opencv::Result<Option<f64>> {
     Ok((sixteenths > 0).then(|| f64::from(sixteenths) / 16.0))
 }
 
-/// P3's text (not its equation 12, which divides by the invalid ones as well: checklist E3).
-fn masked_mean(disparities: &Mat, left_bgr: &Mat, inside: Rect) -> opencv::Result<Option<f64>> {
-    let gate = HsvMask::printed();
-    let (mut sum, mut count) = (0.0, 0.0);
+/// Valid disparities under a mask: P3's text (not its equation 12, which divides by the invalid ones
+/// as well: checklist E3).
+fn masked(
+    disparities: &Mat,
+    left_bgr: &Mat,
+    inside: Rect,
+    gate: &HsvMask,
+) -> opencv::Result<Vec<f64>> {
+    let mut kept = Vec::new();
     for row in inside.y..inside.y + inside.height {
         for column in inside.x..inside.x + inside.width {
-            let kept = gate.keeps(left_bgr.at_2d::<Vec3b>(row, column)?.0);
-            if let (true, Some(disparity)) = (kept, at(disparities, column, row)?) {
-                sum += disparity;
-                count += 1.0;
+            if gate.keeps(left_bgr.at_2d::<Vec3b>(row, column)?.0) {
+                kept.extend(at(disparities, column, row)?);
             }
         }
     }
-    Ok((count > 0.0).then(|| sum / count))
+    Ok(kept)
 }

@@ -1,6 +1,6 @@
 //! Sigma, error and bias as pictures.
 
-use super::outcome::{BEST, NAMES, OURS, PAPER};
+use super::outcome::{BEST, FULL_FRAME, NAMES};
 use super::subpixel::Step;
 use super::tables::{Line, Measured};
 use emberfix_report::{Axis, Chart, Mark, Series, Sheet};
@@ -71,7 +71,7 @@ fn error(table: &Measured) -> Chart {
         Axis::log("mean error, % of the range"),
     );
     let mut chart = Chart::new(format!("{}: error", table.series.name), axes.0, axes.1);
-    for method in 0..=PAPER {
+    for method in 0..NAMES.len() {
         let points = table.lines_of(method);
         let points = points
             .iter()
@@ -99,7 +99,7 @@ fn subpixel(steps: &[Step]) -> Chart {
         Axis::linear("fraction of the disparity, px"),
         Axis::linear("mean error, px"),
     );
-    for method in (0..OURS).chain([PAPER]) {
+    for method in 0..FULL_FRAME.end {
         let points = steps
             .iter()
             .filter_map(|step| Some((step.fraction_px, step.methods[method].bias_px?)));

@@ -31,7 +31,6 @@ pub enum SeedSet {
 
 /// A rig in a studio.
 pub(super) struct Stage {
-    pub name: String,
     pub rig: Rig,
     /// Disparities that a matcher has to try for what stands here.
     pub num_disparities: u32,
@@ -75,8 +74,6 @@ pub(super) struct Trial {
 /// Where the flame truly is.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Truth {
-    /// Depth of the middle of its base.
-    pub stands_m: f64,
     seen: Seen,
     focal_baseline: f64,
     infinity_px: f64,
@@ -126,9 +123,12 @@ impl RigName {
         }
     }
 
-    /// P1's nearest flame stands at 120 px, the others' within 96.
+    /// P1's and P4's nearest flames stand at 120 px, the others' within 96.
     fn num_disparities(self) -> u32 {
-        if self == Self::P1 { 144 } else { 96 }
+        match self {
+            Self::P1 | Self::P4 => 144,
+            Self::Ours75 | Self::Ours120 | Self::Ours500 => 96,
+        }
     }
 }
 
@@ -141,7 +141,6 @@ impl Stage {
     pub(super) fn new(name: RigName, world: &Arc<World>) -> Result<Self, RangeEvalError> {
         let rig = Rig::parse(name.text(), Path::new("the eval's rig"))?;
         Ok(Self {
-            name: rig.name().to_owned(),
             studio: Studio::new(world.clone(), StereoCamera::new(&rig)),
             num_disparities: name.num_disparities(),
             rig,
@@ -158,10 +157,11 @@ impl Stage {
         let mut rng = stream(seed ^ set.salt(), "range trial");
         let set_up = self.set_up(recipe, set, &mut rng);
         let axis = self.boresight();
-        let Some(seen) = self.studio.seen(&set_up.shot, &set_up.left, &axis) else {
+        let (left, seen) = self.studio.expose_left(&set_up.shot, &set_up.left, &axis);
+        let Some(seen) = seen else {
             return Ok(None);
         };
-        let left = mat(&self.studio.expose(&set_up.shot, Eye::Left, &set_up.left))?;
+        let left = mat(&left)?;
         let right = match set_up.right {
             Some(look) => Some(mat(&self.studio.expose(&set_up.shot, Eye::Right, &look))?),
             None => None,
@@ -283,7 +283,6 @@ impl Stage {
         let slant = middle_m.dot(&down) / stands_m;
         let rows_per_m = rows_per_m - slant * rect.focal_px() / stands_m * depth_per_m;
         Truth {
-            stands_m,
             seen,
             focal_baseline: rect.focal_px() * self.rig.baseline_m(),
             infinity_px: rect.infinity_disparity_px(),

@@ -1,6 +1,6 @@
 //! Ranges at stated distances: the papers' tables and ours.
 
-use super::outcome::{Bench, NAMES, Round};
+use super::outcome::{BEST, Bench, NAMES, Round};
 use super::stage::{Recipe, RigName, Stage};
 use super::stats::{deviation, half_interval95, mean, rms};
 use super::{Options, RangeEvalError, Tick};
@@ -129,6 +129,12 @@ impl Series {
         }
     }
 
+    /// Percent that the paper printed at a distance.
+    pub(super) fn printed(&self, distance_m: f64) -> Option<f64> {
+        let place = self.distances_m.iter().position(|d| *d == distance_m)?;
+        self.printed_percent.get(place).copied()
+    }
+
     fn columns(&self) -> std::ops::Range<f64> {
         if self.rig == RigName::P4 {
             215.0..290.0
@@ -246,56 +252,77 @@ impl Line {
     }
 }
 
-/// The table for people.
-pub(super) fn drawn(measured: &Measured) -> Table {
-    let header = [
-        "true, m",
-        "method",
-        "ranges",
-        "mean, m",
-        "SD, m",
-        "95 % of the mean",
-        "bias, %",
-        "error, %",
-        "printed, %",
-        "RMS, px",
-        "sigma, px",
-        "error / sigma",
-    ];
-    let number = |value: Option<f64>, digits: usize| {
-        value.map_or_else(|| "-".to_owned(), |value| format!("{value:.digits$}"))
-    };
-    let row = |line: &Line| {
-        let place = measured
-            .series
-            .distances_m
-            .iter()
-            .position(|d| *d == line.distance_m);
-        let printed = place
-            .and_then(|k| measured.series.printed_percent.get(k))
-            .copied();
-        let interval = line.mean_m.zip(line.interval95_m).map_or_else(
-            || "-".to_owned(),
-            |(mean, half)| format!("{:.3} .. {:.3}", mean - half, mean + half),
-        );
-        vec![
-            format!("{}", line.distance_m),
-            line.method.to_owned(),
-            format!("{}/{}", line.measured, line.of),
-            number(line.mean_m, 3),
-            number(line.deviation_m, 3),
-            interval,
-            number(line.bias_percent, 2),
-            number(line.error_percent, 2),
-            number(printed, 2),
-            number(line.rms_px, 3),
-            number(line.stated_sigma_px, 3),
-            number(line.normalised_error, 2),
+/// The tables for people: the default's own, and everyone's errors side by side.
+pub(super) fn drawn(measured: &Measured) -> [Table; 2] {
+    let rows = measured.lines_of(BEST);
+    let own = Table {
+        title: format!("Ranges by the default, {}", measured.series.name),
+        header: [
+            "true, m",
+            "ranges",
+            "mean, m",
+            "SD, m",
+            "95 % of the mean, m",
+            "bias, %",
+            "error, %",
+            "printed, %",
+            "RMS, px",
+            "sigma, px",
+            "error / sigma",
         ]
+        .map(str::to_owned)
+        .to_vec(),
+        rows: rows
+            .iter()
+            .map(|line| own_row(measured.series, line))
+            .collect(),
     };
-    Table {
-        title: format!("Ranges, {}", measured.series.name),
-        header: header.map(str::to_owned).to_vec(),
-        rows: measured.lines().iter().map(row).collect(),
-    }
+    let mut header = vec!["true, m".to_owned()];
+    header.extend(NAMES.map(str::to_owned));
+    let all = Table {
+        title: format!(
+            "Mean error of the range in percent (of how many), {}",
+            measured.series.name
+        ),
+        header,
+        rows: measured
+            .cells
+            .iter()
+            .map(|cell| all_row(measured.series, cell))
+            .collect(),
+    };
+    [own, all]
+}
+
+fn number(value: Option<f64>, digits: usize) -> String {
+    value.map_or_else(|| "-".to_owned(), |value| format!("{value:.digits$}"))
+}
+
+fn own_row(series: &Series, line: &Line) -> Vec<String> {
+    let interval = line.mean_m.zip(line.interval95_m).map_or_else(
+        || "-".to_owned(),
+        |(mean, half)| format!("{:.3} .. {:.3}", mean - half, mean + half),
+    );
+    vec![
+        format!("{}", line.distance_m),
+        format!("{}/{}", line.measured, line.of),
+        number(line.mean_m, 3),
+        number(line.deviation_m, 3),
+        interval,
+        number(line.bias_percent, 2),
+        number(line.error_percent, 2),
+        number(series.printed(line.distance_m), 2),
+        number(line.rms_px, 3),
+        number(line.stated_sigma_px, 3),
+        number(line.normalised_error, 2),
+    ]
+}
+
+fn all_row(series: &'static Series, cell: &Cell) -> Vec<String> {
+    let mut row = vec![format!("{}", cell.distance_m)];
+    row.extend((0..NAMES.len()).map(|method| {
+        let line = cell.line(series, method);
+        format!("{} ({})", number(line.error_percent, 2), line.measured)
+    }));
+    row
 }
