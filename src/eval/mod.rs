@@ -7,6 +7,7 @@
 //! simulator; nothing that flies depends on this room.
 
 pub mod trend;
+pub mod range;
 
 use emberfix_report::{Figure, PlotError, Sheet};
 use serde::Serialize;
