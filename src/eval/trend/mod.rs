@@ -1,4 +1,5 @@
 //! Trend, size and spread of simulated burns.
 
 pub mod burns;
+pub mod flights;
 pub mod score;
