@@ -9,6 +9,9 @@
 
 mod file;
 mod nearest;
+mod page;
+mod parts;
+mod plausible;
 mod rectify;
 pub mod solve;
 #[cfg(test)]
@@ -16,6 +19,9 @@ mod tests;
 
 pub use file::RigError;
 pub use nearest::{Checks, KeyProblem, nearest_key, toml_problem, unknown_keys};
+pub use page::{PageInput, page};
+pub use parts::{Calibrated, Mounting, RigParts, mount_angles};
+pub use plausible::{Finding, MAX_K3, MAX_TURN_DEG, Severity, implausible};
 pub use rectify::Rectification;
 
 use emberfix_frames::{
@@ -92,6 +98,8 @@ pub struct Rig {
     max_skew_s: f64,
     sigmas: RigSigmas,
     rectification: Rectification,
+    calibrated: Option<Calibrated>,
+    doubts: Vec<Finding>,
 }
 
 impl Rig {
@@ -163,6 +171,16 @@ impl Rig {
     #[must_use]
     pub fn sigmas(&self) -> &RigSigmas {
         &self.sigmas
+    }
+    /// What the calibration said of itself, if the file tells.
+    #[must_use]
+    pub fn calibrated(&self) -> Option<&Calibrated> {
+        self.calibrated.as_ref()
+    }
+    /// What is implausible, yet no reason to refuse the rig.
+    #[must_use]
+    pub fn doubts(&self) -> &[Finding] {
+        &self.doubts
     }
     /// The rectified pair's geometry and the way into it.
     #[must_use]

@@ -50,6 +50,18 @@ pub fn parameter_names() -> [&'static str; GLOBALS] {
     ]
 }
 
+/// The shared parameters of a solution as a list.
+pub(super) fn values(solution: &StereoSolution) -> GlobalVector {
+    let turn = UnitQuaternion::from_matrix(&solution.right_from_left).scaled_axis();
+    let values = intrinsics(&solution.left).into_iter();
+    GlobalVector::from_iterator(
+        values
+            .chain(intrinsics(&solution.right))
+            .chain(turn.iter().copied())
+            .chain(solution.translation_m.iter().copied()),
+    )
+}
+
 /// A board in the left camera: takes board components to left-camera components.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct BoardPose {

@@ -11,6 +11,7 @@
 //! **Known limits.** Every view needs the board in both eyes.
 
 mod board;
+mod calibration;
 mod charuco;
 mod dictionary;
 mod find;
@@ -21,6 +22,10 @@ mod start;
 mod trust;
 
 pub use board::{Board, BoardError, BoardKind};
+pub use calibration::{
+    COVERAGE_CELLS, Calibration, Demands, TOLD_DEPTHS_M, calibrate, cell, epipolar_rms_px,
+    rectification,
+};
 pub use find::{find_corners, make_consistent, read_grey};
 pub use joint::{BoardPose, GLOBALS, GlobalMatrix, GlobalVector, parameter_names};
 pub use predict::{RangeError, disparity_sigma_px, range_errors};
@@ -131,6 +136,12 @@ impl StereoSolution {
         let along = self.translation_m.normalize();
         let block = self.covariance.fixed_view::<3, 3>(21, 21);
         (along.transpose() * block * along)[0].max(0.0).sqrt()
+    }
+
+    /// Every shared parameter, in the order of [`parameter_names`]; the rotation as a vector.
+    #[must_use]
+    pub fn values(&self) -> GlobalVector {
+        joint::values(self)
     }
 
     /// One sigma of every parameter, in the order of [`parameter_names`].
