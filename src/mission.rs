@@ -14,6 +14,7 @@ use serde::Deserialize;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+mod gimbal;
 mod terrain;
 
 /// Why a mission file was refused.
@@ -114,6 +115,7 @@ struct RawMission {
     #[serde(default)]
     range: RawRange,
     terrain: Option<terrain::RawTerrain>,
+    gimbal: Option<gimbal::RawGimbal>,
     #[serde(default)]
     sigma: RawSigma,
     #[serde(default)]
@@ -270,6 +272,10 @@ const KNOWN: &[&str] = &[
     "terrain.horizontal_sigma_m",
     "terrain.canopy_m",
     "terrain.reach_m",
+    "gimbal.pivot_m",
+    "gimbal.component_id",
+    "gimbal.device_id",
+    "gimbal.sigma_deg",
     "sigma.gnss_horizontal_m",
     "sigma.gnss_vertical_m",
     "sigma.gnss_floor_m",
@@ -373,6 +379,9 @@ fn check(raw: &RawMission) -> Vec<String> {
     check_numbers(&mut checks, raw);
     if let Some(terrain) = &raw.terrain {
         terrain.check(&mut checks);
+    }
+    if let Some(gimbal) = &raw.gimbal {
+        gimbal.check(&mut checks);
     }
     check_sigma(&mut checks, &raw.sigma);
     checks.range(
@@ -491,6 +500,8 @@ fn build(raw: RawMission, path: &Path) -> Result<Mission, MissionError> {
             gnss_horizontal_m: raw.sigma.gnss_horizontal_m,
             gnss_vertical_m: raw.sigma.gnss_vertical_m,
             gnss_floor_m: raw.sigma.gnss_floor_m,
+            rolling_readout_s: rig.rolling_readout_s(),
+            gimbal: raw.gimbal.as_ref().map(gimbal::RawGimbal::build),
             ..PoseConfig::default()
         },
         shared: SharedPriors {
@@ -499,7 +510,11 @@ fn build(raw: RawMission, path: &Path) -> Result<Mission, MissionError> {
             heading_rad: raw.sigma.heading_deg.to_radians(),
             heading_constant_share: raw.sigma.heading_constant_share,
             heading_correlation_s: raw.sigma.heading_correlation_s,
-            tilt_rad: raw.sigma.tilt_deg.to_radians(),
+            tilt_rad: (raw.sigma.tilt_deg.to_radians()).hypot(
+                raw.gimbal
+                    .as_ref()
+                    .map_or(0.0, gimbal::RawGimbal::sigma_rad),
+            ),
             tilt_constant_share: raw.sigma.tilt_constant_share,
             tilt_correlation_s: raw.sigma.tilt_correlation_s,
         },

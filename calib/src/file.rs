@@ -83,6 +83,8 @@ struct RawMount {
 #[derive(Deserialize)]
 struct RawTime {
     camera_offset_s: f64,
+    #[serde(default)]
+    rolling_readout_s: f64,
 }
 
 #[derive(Deserialize)]
@@ -120,6 +122,7 @@ const KNOWN: &[&str] = &[
     "mount.roll_deg",
     "mount.lever_arm_m",
     "time.camera_offset_s",
+    "time.rolling_readout_s",
     "sigma.disparity_bias_px",
     "sigma.boresight_deg",
     "sigma.lever_arm_m",
@@ -194,6 +197,13 @@ fn check(raw: &RawRig) -> Vec<String> {
         -2.0,
         2.0,
         " (seconds)",
+    );
+    checks.range(
+        "time.rolling_readout_s",
+        raw.time.rolling_readout_s,
+        0.0,
+        0.2,
+        " (0 is a global shutter)",
     );
     let sigma = &raw.sigma;
     checks.range(
@@ -342,6 +352,7 @@ fn build(raw: RawRig, path: &Path) -> Result<Rig, RigError> {
         },
         lever_arm: Vector::from_metres(Vector3::from(raw.mount.lever_arm_m)),
         time_offset_s: raw.time.camera_offset_s,
+        rolling_readout_s: raw.time.rolling_readout_s,
         max_skew_s: raw.stereo.max_skew_s,
         sigmas: RigSigmas {
             disparity_bias_px: raw.sigma.disparity_bias_px,

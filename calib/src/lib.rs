@@ -5,7 +5,8 @@
 //! **Out:** pixels to rectified pixels, rectified pixels to rays, camera to body.
 //!
 //! **Assumptions.** Pinhole cameras with OpenCV's five-term distortion (k1 k2 p1 p2 k3), pixel
-//! centres at whole numbers. **Known limits.** No fisheye, no rolling-shutter model.
+//! centres at whole numbers. **Known limits.** No fisheye; a rolling shutter has a time
+//! but no model.
 
 mod file;
 mod nearest;
@@ -95,6 +96,7 @@ pub struct Rig {
     mount: MountAngles,
     lever_arm: Vector<BodyFrd>,
     time_offset_s: f64,
+    rolling_readout_s: f64,
     max_skew_s: f64,
     sigmas: RigSigmas,
     rectification: Rectification,
@@ -161,6 +163,11 @@ impl Rig {
     #[must_use]
     pub fn time_offset_s(&self) -> f64 {
         self.time_offset_s
+    }
+    /// From the exposure of the first row to that of the last, seconds; 0 for a global shutter.
+    #[must_use]
+    pub fn rolling_readout_s(&self) -> f64 {
+        self.rolling_readout_s
     }
     /// Greatest difference of the eyes' exposures that still counts as one moment, seconds.
     #[must_use]
