@@ -34,14 +34,19 @@ pub fn location(arguments: &LocationArguments) -> Result<(), Failure> {
 }
 
 fn options(arguments: &LocationArguments) -> Options {
-    let flights = if arguments.quick {
-        arguments.flights.min(480)
-    } else {
-        arguments.flights
-    };
+    let scale = if arguments.quick { 25 } else { 1 };
+    let flights = (arguments.flights / scale).max(96);
     Options {
         flights,
         foreign_flights: flights / 10,
+        p3_flights: 4000 / scale,
+        mount_flights: 200 / scale,
+        incident_flights: 400 / scale,
+        timed_fires: if arguments.quick {
+            vec![1000]
+        } else {
+            vec![1000, 10_000]
+        },
         seed: arguments.seed,
         kinds: if arguments.kind.is_empty() {
             Kind::ALL.to_vec()

@@ -99,6 +99,19 @@ pub struct Told {
     pub ce90_m: f64,
 }
 
+/// What the estimator has learned of errors that all fires share.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Learned {
+    /// All that turns the camera against the reported attitude, about body axes, radians.
+    pub pointing_rad: Vector3<f64>,
+    /// The mount's own share of it.
+    pub boresight_rad: Vector3<f64>,
+    /// Camera clock late, seconds.
+    pub clock_s: f64,
+    /// Its sigma, seconds.
+    pub clock_sigma_s: f64,
+}
+
 /// The service's side of one flight.
 pub struct Pilot {
     rig: Rig,
@@ -175,6 +188,18 @@ impl Pilot {
                 }
             })
             .collect()
+    }
+
+    /// What it has learned of the errors that all fires share.
+    #[must_use]
+    pub fn learned(&self) -> Learned {
+        let shared = self.tracker.joint().shared();
+        Learned {
+            pointing_rad: Vector3::new(shared[4], shared[5], shared[6]),
+            boresight_rad: Vector3::zeros(),
+            clock_s: shared[8] * self.errors.clock_s,
+            clock_sigma_s: self.errors.clock_s,
+        }
     }
 
     fn pose(&self, reported: &Reported) -> Option<Pose> {
