@@ -14,10 +14,12 @@
 //! **Known limits.** A fire is a point with a size, not an area. The cost of a sighting is quadratic
 //! in the fires that are kept, so at most [`MAX_FIRES`] are.
 
+mod advice;
 mod estimate;
 mod joint;
 mod life;
 
+pub use advice::{ADVISED, Advice, LookQuality, Outlook, advise};
 pub use estimate::Estimate;
 pub use joint::{Joint, MAX_FIRES};
 pub use life::Evidence;

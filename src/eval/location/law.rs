@@ -200,7 +200,7 @@ mod tests {
                     &[0.0, 30.0, 100.0],
                     Law::Assumed,
                 );
-                values[0].x * values[2].x / (1.5 * 1.5)
+                values[0][0] * values[2][0] / (1.5 * 1.5)
             })
             .sum();
         // 0.5 + 0.5 exp(-100 / 60); one sigma of the mean of 4000 products is 0.017.

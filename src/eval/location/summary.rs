@@ -5,6 +5,7 @@ use super::flight::Kind;
 use super::incidents::{FALSE_BOX, MISS, SIGMA_LOOKS, SIGMAS_APART, share_right};
 use super::law::Law;
 use super::monte_carlo::{Flown, GROUND_SIGMA_M, OBSERVABLE_SHARE};
+use super::printed::printed_errors_m;
 use super::score::{Scored, consistency};
 use super::truth::{ErrorModel, Gnss};
 use super::{Campaign, Options, mount, p3, plots};
@@ -65,7 +66,7 @@ pub(super) fn report(options: &Options, campaign: &Campaign) -> Report {
             "kinds": kinds(&campaign.flown),
             "laws": &laws,
             "p3": p3,
-            "p3_printed_m": { "mean": p3::PRINTED_M.0, "bias": p3::PRINTED_M.1 },
+            "p3_printed_m": printed_errors_m(),
             "mount": gusty,
             "steady_orbit": steady,
             "one_fire": &campaign.one,
@@ -237,7 +238,7 @@ fn metres(value: f64) -> String {
 
 fn p3_table(p3: &p3::P3Summary) -> Table {
     let row = |what: &str, mean: String, bias: String| vec![what.to_owned(), mean, bias];
-    let (mean, bias) = p3::PRINTED_M;
+    let (mean, bias) = printed_errors_m();
     Table {
         title: "P3's flight after ten sightings, metres".to_owned(),
         header: ["", "mean horizontal error", "constant part"]
@@ -245,6 +246,11 @@ fn p3_table(p3: &p3::P3Summary) -> Table {
             .to_vec(),
         rows: vec![
             row("emberfix", metres(p3.horizontal_mean_m), metres(p3.bias_m)),
+            row(
+                "Cramér-Rao bound",
+                metres(p3.bound_m.0),
+                metres(p3.bound_m.1),
+            ),
             row(
                 "P3's method, corrected (E1, E3, E4, E5)",
                 metres(p3.corrected_mean_m),
