@@ -4,7 +4,7 @@
 //! mission file. The `[sim]` table belongs to the simulator and is not read here.
 
 use crate::detect::{DetectorConfig, Family};
-use crate::locate::{ConstantPlane, SharedSigmas, Terrain};
+use crate::locate::{ConstantPlane, SharedPriors, Terrain};
 use crate::pose::PoseConfig;
 use crate::range::SgbmConfig;
 use crate::track::TrackConfig;
@@ -77,8 +77,8 @@ pub struct Mission {
     pub terrain: Option<Arc<dyn Terrain>>,
     /// Defaults and limits of the pose.
     pub pose: PoseConfig,
-    /// Errors that stay the same from frame to frame.
-    pub shared: SharedSigmas,
+    /// What is known beforehand of the errors that all sightings share.
+    pub shared: SharedPriors,
     /// The tracker.
     pub track: TrackConfig,
     /// The ground agent.
@@ -172,21 +172,29 @@ struct RawSigma {
     gnss_floor_m: f64,
     heading_deg: f64,
     tilt_deg: f64,
+    gnss_constant_share: f64,
     gnss_correlation_s: f64,
+    heading_constant_share: f64,
     heading_correlation_s: f64,
+    tilt_constant_share: f64,
+    tilt_correlation_s: f64,
 }
 
 impl Default for RawSigma {
     fn default() -> Self {
-        let (pose, track) = (PoseConfig::default(), TrackConfig::default());
+        let (pose, shared) = (PoseConfig::default(), SharedPriors::default());
         Self {
             gnss_horizontal_m: pose.gnss_horizontal_m,
             gnss_vertical_m: pose.gnss_vertical_m,
             gnss_floor_m: pose.gnss_floor_m,
-            heading_deg: 2.0,
-            tilt_deg: 0.5,
-            gnss_correlation_s: track.gnss_correlation_s,
-            heading_correlation_s: track.heading_correlation_s,
+            heading_deg: shared.heading_rad.to_degrees(),
+            tilt_deg: shared.tilt_rad.to_degrees(),
+            gnss_constant_share: shared.gnss_constant_share,
+            gnss_correlation_s: shared.gnss_correlation_s,
+            heading_constant_share: shared.heading_constant_share,
+            heading_correlation_s: shared.heading_correlation_s,
+            tilt_constant_share: shared.tilt_constant_share,
+            tilt_correlation_s: shared.tilt_correlation_s,
         }
     }
 }
@@ -261,8 +269,12 @@ const KNOWN: &[&str] = &[
     "sigma.gnss_floor_m",
     "sigma.heading_deg",
     "sigma.tilt_deg",
+    "sigma.gnss_constant_share",
     "sigma.gnss_correlation_s",
+    "sigma.heading_constant_share",
     "sigma.heading_correlation_s",
+    "sigma.tilt_constant_share",
+    "sigma.tilt_correlation_s",
     "track.confirm_sightings",
     "track.confirm_span_s",
     "track.forget_suspected_s",
@@ -438,20 +450,20 @@ fn check_sigma(checks: &mut Checks, sigma: &RawSigma) {
         " (degrees)",
     );
     checks.range("sigma.tilt_deg", sigma.tilt_deg, 0.01, 45.0, " (degrees)");
-    checks.range(
-        "sigma.gnss_correlation_s",
-        sigma.gnss_correlation_s,
-        1.0,
-        1e6,
-        "",
-    );
-    checks.range(
-        "sigma.heading_correlation_s",
-        sigma.heading_correlation_s,
-        1.0,
-        1e6,
-        "",
-    );
+    for (key, share) in [
+        ("sigma.gnss_constant_share", sigma.gnss_constant_share),
+        ("sigma.heading_constant_share", sigma.heading_constant_share),
+        ("sigma.tilt_constant_share", sigma.tilt_constant_share),
+    ] {
+        checks.range(key, share, 0.0, 1.0, " (of the variance)");
+    }
+    for (key, seconds) in [
+        ("sigma.gnss_correlation_s", sigma.gnss_correlation_s),
+        ("sigma.heading_correlation_s", sigma.heading_correlation_s),
+        ("sigma.tilt_correlation_s", sigma.tilt_correlation_s),
+    ] {
+        checks.range(key, seconds, 1.0, 1e6, "");
+    }
 }
 
 fn build(raw: RawMission, path: &Path) -> Result<Mission, MissionError> {
@@ -490,16 +502,19 @@ fn build(raw: RawMission, path: &Path) -> Result<Mission, MissionError> {
             gnss_floor_m: raw.sigma.gnss_floor_m,
             ..PoseConfig::default()
         },
-        shared: SharedSigmas {
+        shared: SharedPriors {
+            gnss_constant_share: raw.sigma.gnss_constant_share,
+            gnss_correlation_s: raw.sigma.gnss_correlation_s,
             heading_rad: raw.sigma.heading_deg.to_radians(),
+            heading_constant_share: raw.sigma.heading_constant_share,
+            heading_correlation_s: raw.sigma.heading_correlation_s,
             tilt_rad: raw.sigma.tilt_deg.to_radians(),
+            tilt_constant_share: raw.sigma.tilt_constant_share,
+            tilt_correlation_s: raw.sigma.tilt_correlation_s,
         },
         track: TrackConfig {
             confirm_sightings: raw.track.confirm_sightings,
             confirm_span_s: raw.track.confirm_span_s,
-            gnss_correlation_s: raw.sigma.gnss_correlation_s,
-            heading_correlation_s: raw.sigma.heading_correlation_s,
-            mount_correlation_s: TrackConfig::default().mount_correlation_s,
             forget_suspected_s: raw.track.forget_suspected_s,
         },
         ground: GroundLinks {

@@ -2,9 +2,9 @@
 
 use super::truth::{Autopilot, ErrorModel, Flame, IMAGE_PX, LEVER_ARM_M, Lens, Reported, Seen};
 use crate::alarm::{AlarmClass, FireId};
-use crate::locate::{DisparityOf, SharedSigmas, Sighting, Terrain, View};
+use crate::locate::{DisparityOf, SharedPriors, Sighting, Terrain, View};
 use crate::pose::Pose;
-use crate::track::{Classified, TrackConfig, Tracker};
+use crate::track::{Classified, Estimated, TrackConfig, Tracker};
 use emberfix_calib::{RectifiedPixel, Rig, RigError};
 use emberfix_frames::{
     Attitude, Covariance, EllipsoidHeight, MissionEnu, ServiceTime, Wgs84, Wgs84Parts,
@@ -114,11 +114,16 @@ pub struct Learned {
 
 /// The service's side of one flight.
 pub struct Pilot {
+    kit: Kit,
+    tracker: Tracker,
+}
+
+/// What the service is told before it flies.
+struct Kit {
     rig: Rig,
     datum: Wgs84,
     errors: ErrorModel,
-    sigmas: SharedSigmas,
-    tracker: Tracker,
+    priors: SharedPriors,
     ground: Option<Ground>,
 }
 
@@ -132,38 +137,35 @@ impl Pilot {
         errors: &ErrorModel,
         ground: Option<Ground>,
     ) -> Result<Self, SetupError> {
-        let config = TrackConfig {
-            gnss_correlation_s: errors.gnss_correlation_s,
-            heading_correlation_s: errors.heading_correlation_s,
-            ..TrackConfig::default()
-        };
         let height = EllipsoidHeight::from_m(DATUM.height_m);
         let datum = place_from_degrees(DATUM.latitude_deg, DATUM.longitude_deg, height)
             .map_err(|error| SetupError::Place(error.to_string()))?;
-        Ok(Self {
+        let kit = Kit {
             rig: Rig::from_toml(&rig_toml(lens, errors), "evaluation")?,
             datum,
             errors: *errors,
-            sigmas: SharedSigmas {
-                heading_rad: errors.heading_deg.to_radians(),
-                tilt_rad: errors.tilt_deg.to_radians(),
-            },
-            tracker: Tracker::new(config, FireId(1)),
+            priors: priors(errors),
             ground,
+        };
+        Ok(Self {
+            kit,
+            tracker: Tracker::new(TrackConfig::default(), FireId(1)),
         })
     }
 
     /// Takes one look in; says which fire each sighting was given to.
     pub fn look(&mut self, autopilot: &Autopilot<'_>, seen: &[Seen]) -> Vec<Option<u32>> {
-        let Some(pose) = self.pose(&autopilot.report(0.0)) else {
+        let kit = &self.kit;
+        let Some(pose) = kit.pose(&autopilot.report(0.0)) else {
             return vec![None; seen.len()];
         };
-        let view = View::new(&self.rig, &pose, &self.sigmas, &self.datum);
+        let motion = |later_s: f64| kit.pose(&autopilot.report(later_s));
+        let view = View::new(&kit.rig, &pose, &kit.priors, &kit.datum).with_motion(&motion);
         let classified: Vec<_> = seen
             .iter()
-            .map(|seen| classified(seen, &self.errors, pose.at))
+            .map(|seen| classified(seen, &kit.errors, pose.at))
             .collect();
-        let terrain = self.ground.as_ref().map(|ground| ground as &dyn Terrain);
+        let terrain = kit.ground.as_ref().map(|ground| ground as &dyn Terrain);
         let outcomes = self.tracker.step(&view, &classified, terrain);
         outcomes
             .iter()
@@ -192,16 +194,19 @@ impl Pilot {
 
     /// What it has learned of the errors that all fires share.
     #[must_use]
-    pub fn learned(&self) -> Learned {
-        let shared = self.tracker.joint().shared();
-        Learned {
-            pointing_rad: Vector3::new(shared[4], shared[5], shared[6]),
-            boresight_rad: Vector3::zeros(),
-            clock_s: shared[8] * self.errors.clock_s,
-            clock_sigma_s: self.errors.clock_s,
-        }
+    pub fn learned(&self) -> Option<Learned> {
+        let shared = self.tracker.shared_errors()?;
+        let value = |of: &[Estimated; 3]| Vector3::from_fn(|axis, _| of[axis].value);
+        Some(Learned {
+            pointing_rad: value(&shared.pointing_rad),
+            boresight_rad: value(&shared.boresight_rad),
+            clock_s: shared.clock_s.value,
+            clock_sigma_s: shared.clock_s.sigma,
+        })
     }
+}
 
+impl Kit {
     fn pose(&self, reported: &Reported) -> Option<Pose> {
         let place = TangentPlane::at(DATUM).to_lla(reported.position_m);
         let height = EllipsoidHeight::from_m(place.height_m);
@@ -220,6 +225,19 @@ impl Pilot {
             time_sigma_s: 0.0,
             degraded: BTreeSet::new(),
         })
+    }
+}
+
+fn priors(errors: &ErrorModel) -> SharedPriors {
+    SharedPriors {
+        gnss_constant_share: errors.gnss_constant_share,
+        gnss_correlation_s: errors.gnss_correlation_s,
+        heading_rad: errors.heading_deg.to_radians(),
+        heading_constant_share: errors.heading_constant_share,
+        heading_correlation_s: errors.heading_correlation_s,
+        tilt_rad: errors.tilt_deg.to_radians(),
+        tilt_constant_share: errors.tilt_constant_share,
+        tilt_correlation_s: errors.tilt_correlation_s,
     }
 }
 
@@ -323,6 +341,7 @@ mod tests {
             let flame = flame(Vector3::new(1.0, -2.0, 0.0), 2.0);
             let sight = camera.sight(&flame).unwrap();
             let pose = pilot
+                .kit
                 .pose(&Reported {
                     t_s,
                     position_m: state.position_m,
@@ -331,7 +350,7 @@ mod tests {
                     rate_rad_s: state.rate_rad_s,
                 })
                 .unwrap();
-            let view = View::new(&pilot.rig, &pose, &pilot.sigmas, &pilot.datum);
+            let view = View::new(&pilot.kit.rig, &pose, &pilot.kit.priors, &pilot.kit.datum);
             let predicted = view.predict(&flame.base_m).unwrap();
             let apart = (predicted.pixel.u - sight.base.x).hypot(predicted.pixel.v - sight.base.y);
             assert!(apart < 0.02, "{apart} px apart");

@@ -91,10 +91,11 @@ pub fn fly(rng: &mut ChaCha8Rng, gusty: bool) -> Result<Option<MountFlown>, Setu
             early = (early.0 + 1, early.1 + u32::from(scored.nees <= CHI2_2_90));
         }
     }
-    let (Some(last), Some(truth), Some(end)) = (last, wandered.last(), times_s.last()) else {
+    let (Some(last), Some(truth), Some(end), Some(learned)) =
+        (last, wandered.last(), times_s.last(), pilot.learned())
+    else {
         return Ok(None);
     };
-    let learned = pilot.learned();
     let state = course.state(*end);
     let pointing = learned.pointing_rad - pointing(truth, &state.enu_from_body);
     let sight = (state.enu_from_body.transpose() * -state.position_m).normalize();
