@@ -102,6 +102,14 @@ impl Rig {
         file::load(path)
     }
 
+    /// Checks a rig file's text that did not come from a file; `name` stands for the path in errors.
+    ///
+    /// # Errors
+    /// [`RigError`] that names every problem in it.
+    pub fn from_toml(text: &str, name: &str) -> Result<Self, RigError> {
+        file::parse(text, std::path::Path::new(name))
+    }
+
     /// Name of the rig, for reports.
     #[must_use]
     pub fn name(&self) -> &str {
