@@ -8,6 +8,7 @@
 
 pub mod trend;
 pub mod range;
+pub mod location;
 
 use emberfix_report::{Figure, PlotError, Sheet};
 use serde::Serialize;

@@ -20,6 +20,7 @@
 //! all fires alike, the part that the kept knots do not tell is lost (see [`Common`]).
 //! **Bound.** [`MAX_FIRES`] are kept; beyond, the suspected one with the least evidence goes.
 
+mod advice;
 mod assign;
 mod block;
 mod common;
@@ -30,6 +31,7 @@ mod measure;
 mod pairs;
 mod shared_errors;
 
+pub use advice::{ADVISED, Advice, LookQuality, Outlook, advise};
 pub use assign::{Candidate, assign};
 pub use block::{Block, Chart};
 pub use common::{COMMON, Common, KNOTS};
@@ -343,7 +345,7 @@ impl Tracker {
             (Some(terrain), None) => terrain.sigma_m(&view.pose.place),
             (None, _) => 0.0,
         };
-        let estimate = Estimate::unseen(sighting, lens, terrain_sigma);
+        let estimate = Estimate::unseen(sighting, lens, terrain_sigma, &self.common);
         let taken = estimate.take(sighting, lens, view, terrain, &self.common, fix.as_ref())?;
         let id = self.next;
         self.next = FireId(id.0.saturating_add(1));
