@@ -484,6 +484,12 @@ impl Lens {
         &self.enu_from_cam
     }
 
+    /// Metres that the centre moves per sigma of each shared error.
+    #[must_use]
+    pub fn centre_by_shared(&self) -> &SMatrix<f64, 3, SHARED> {
+        &self.centre_by_shared
+    }
+
     /// Unit vector of a pixel's ray in the mission plane.
     #[must_use]
     pub fn ray_enu(&self, pixel: RectifiedPixel) -> Vector3<f64> {

@@ -8,14 +8,19 @@
 //! nearly linear in it) and becomes a plain position once it is held well enough.
 
 use super::common::{COMMON, Common, Passage};
-use crate::locate::{Distant, Lens};
+use crate::locate::{Distant, Lens, SHARED};
 use emberfix_frames::{Matrix3, Vector3};
 use nalgebra::{DMatrix, DVector, SMatrix, SVector};
 
-/// Numbers per fire: three coordinates, and by how much the ground there is above its model, metres.
-pub const PER_FIRE: usize = 4;
-/// Index of the terrain's offset.
+/// Numbers per fire: a place, by how much the ground there is above its model, and the way from the
+/// place to the fire while that is needed.
+pub const PER_FIRE: usize = 7;
+/// Index of the terrain's offset, metres.
 pub const TERRAIN: usize = 3;
+/// Index of the way: tangents to the right and down, inverse depth (1/m).
+const WAY: usize = 4;
+/// Index of the inverse depth.
+pub const INVERSE_DEPTH: usize = WAY + 2;
 /// Numbers of one sighting: column, row, disparity, height above the terrain.
 pub const MEASURED: usize = 4;
 
@@ -23,19 +28,23 @@ pub const MEASURED: usize = 4;
 pub type State = SVector<f64, PER_FIRE>;
 /// How coordinates follow the common state.
 pub type ByCommon = SMatrix<f64, PER_FIRE, COMMON>;
+/// Three numbers over the coordinates.
+pub type ByState = SMatrix<f64, 3, PER_FIRE>;
 type Own = SMatrix<f64, PER_FIRE, PER_FIRE>;
 
-/// What the first three coordinates mean.
+/// What the coordinates mean. Places are east, north, up in the mission plane, metres.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Chart {
-    /// Tangents to the right and down, and inverse depth (1/m), seen from a fixed origin.
+    /// The place is where the camera was at the first sighting, and a way leads from there to the fire.
+    ///
+    /// The camera's place is part of the state, since it has its errors: an offset of GNSS moves it
+    /// and leaves the way alone, whatever the way's length turns out to be. Held fixed, each better
+    /// length would seem to say something of that offset, which no sighting does.
     Anchored {
-        /// Fixed, mission plane, metres.
-        origin: Vector3<f64>,
-        /// Right, down, forward; mission plane.
+        /// Right, down, forward of the way; mission plane.
         axes: Matrix3<f64>,
     },
-    /// East, north, up in the mission plane, metres.
+    /// The place is the fire's.
     Plane,
 }
 
@@ -48,7 +57,7 @@ pub struct Measurement {
     /// Over the fire's coordinates.
     pub by_state: SMatrix<f64, MEASURED, PER_FIRE>,
     /// Over the shared errors of this moment.
-    pub by_shared: SMatrix<f64, MEASURED, { crate::locate::SHARED }>,
+    pub by_shared: SMatrix<f64, MEASURED, SHARED>,
     /// Variances; rows are independent.
     pub noise: SVector<f64, MEASURED>,
 }
@@ -94,26 +103,37 @@ const ANY_TANGENT: f64 = 3.0;
 const HELD: (f64, f64) = (0.2, 0.1);
 
 impl Block {
-    /// Nothing known but where it was looked for: `lens` at the pixel's ray, and an inverse depth.
+    /// Nothing known but where it was looked for: from `lens` along `ray`, at an inverse depth.
     #[must_use]
     pub fn unseen(
         lens: &Lens,
         ray: &Vector3<f64>,
         inverse_depth: (f64, f64),
         terrain_sigma_m: f64,
+        common: &Common,
     ) -> Self {
         let right = lens.enu_from_cam().column(0).into_owned();
         let right = (right - ray * right.dot(ray)).normalize();
         let axes = Matrix3::from_columns(&[right, ray.cross(&right), *ray]);
         let (depth, depth_sigma) = inverse_depth;
-        let sigmas = State::new(ANY_TANGENT, ANY_TANGENT, depth_sigma, terrain_sigma_m);
+        let mut sigmas = State::zeros();
+        sigmas[TERRAIN] = terrain_sigma_m;
+        sigmas[WAY] = ANY_TANGENT;
+        sigmas[WAY + 1] = ANY_TANGENT;
+        sigmas[INVERSE_DEPTH] = depth_sigma;
+        let mut by_common = ByCommon::zeros();
+        by_common
+            .fixed_view_mut::<3, SHARED>(0, 0)
+            .copy_from(lens.centre_by_shared());
+        let mut offset = State::zeros();
+        offset
+            .fixed_rows_mut::<3>(0)
+            .copy_from(&(lens.centre() - lens.centre_by_shared() * common.now()));
+        offset[INVERSE_DEPTH] = depth;
         Self {
-            chart: Chart::Anchored {
-                origin: *lens.centre(),
-                axes,
-            },
-            offset: State::new(0.0, 0.0, depth, 0.0),
-            by_common: ByCommon::zeros(),
+            chart: Chart::Anchored { axes },
+            offset,
+            by_common,
             own: Own::from_diagonal(&sigmas.component_mul(&sigmas)),
         }
     }
@@ -166,7 +186,7 @@ impl Block {
     #[must_use]
     pub fn tells(&self, m: &Measurement, at: &State, common: &Common) -> Option<Told> {
         let mut rows = m.by_state * self.by_common;
-        let mut now = rows.fixed_columns_mut::<{ crate::locate::SHARED }>(0);
+        let mut now = rows.fixed_columns_mut::<SHARED>(0);
         now += m.by_shared;
         let residual = m.residual - m.by_state * (self.state(common) - at);
         let mut spread = m.by_state * self.own * m.by_state.transpose();
@@ -213,18 +233,21 @@ impl Block {
             return false;
         };
         let state = self.state(common);
-        let relative = |variance: f64| variance.max(0.0).sqrt() / state[2].max(LEAST_INVERSE_DEPTH);
-        if relative(covariance[(2, 2)]) > HELD.0 || relative(self.own[(2, 2)]) > HELD.1 {
+        let depth = state[INVERSE_DEPTH].max(LEAST_INVERSE_DEPTH);
+        let relative = |of: &Own| of[(INVERSE_DEPTH, INVERSE_DEPTH)].max(0.0).sqrt() / depth;
+        if relative(covariance) > HELD.0 || relative(&self.own) > HELD.1 {
             return false;
         }
-        let mut by_state = Own::identity();
+        let mut by_state = Own::zeros();
         by_state
-            .fixed_view_mut::<3, 3>(0, 0)
+            .fixed_rows_mut::<3>(0)
             .copy_from(&self.chart.position_by_state(&state));
-        let mut settled = state;
+        by_state[(TERRAIN, TERRAIN)] = 1.0;
+        let mut settled = State::zeros();
         settled
             .fixed_rows_mut::<3>(0)
             .copy_from(&self.chart.position(&state));
+        settled[TERRAIN] = state[TERRAIN];
         self.chart = Chart::Plane;
         self.by_common = by_state * self.by_common;
         let own = by_state * self.own * by_state.transpose();
@@ -236,22 +259,24 @@ impl Block {
 }
 
 impl Chart {
-    /// The point for the camera's model, and its slopes over the three coordinates.
+    /// The point for the camera's model, and the slopes of its `at` and `over`.
     #[must_use]
-    pub fn distant(&self, state: &State) -> (Distant, Matrix3<f64>, Vector3<f64>) {
-        match self {
-            Self::Plane => {
-                let point = state.fixed_rows::<3>(0).into_owned();
-                (Distant::near(point), Matrix3::identity(), Vector3::zeros())
-            }
-            Self::Anchored { origin, axes } => {
-                let over = state[2].max(LEAST_INVERSE_DEPTH);
-                let at = origin * over + axes * Vector3::new(state[0], state[1], 1.0);
-                let mut by = *axes;
-                by.set_column(2, origin);
-                (Distant { at, over }, by, Vector3::z())
-            }
-        }
+    pub fn distant(&self, state: &State) -> (Distant, ByState, SMatrix<f64, 1, PER_FIRE>) {
+        let place = state.fixed_rows::<3>(0).into_owned();
+        let (mut by, mut over_by) = (ByState::zeros(), SMatrix::<f64, 1, PER_FIRE>::zeros());
+        let Self::Anchored { axes } = self else {
+            by.fixed_columns_mut::<3>(0).copy_from(&Matrix3::identity());
+            return (Distant::near(place), by, over_by);
+        };
+        let over = state[INVERSE_DEPTH].max(LEAST_INVERSE_DEPTH);
+        let at = place * over + axes * Vector3::new(state[WAY], state[WAY + 1], 1.0);
+        by.fixed_columns_mut::<3>(0)
+            .copy_from(&(Matrix3::identity() * over));
+        by.fixed_columns_mut::<2>(WAY)
+            .copy_from(&axes.fixed_columns::<2>(0));
+        by.set_column(INVERSE_DEPTH, &place);
+        over_by[INVERSE_DEPTH] = 1.0;
+        (Distant { at, over }, by, over_by)
     }
 
     /// Position in the mission plane, metres.
@@ -261,10 +286,10 @@ impl Chart {
         point.at / point.over
     }
 
-    /// Position over the three coordinates.
+    /// Position over the coordinates.
     #[must_use]
-    pub fn position_by_state(&self, state: &State) -> Matrix3<f64> {
+    pub fn position_by_state(&self, state: &State) -> ByState {
         let (point, by, over_by) = self.distant(state);
-        by / point.over - point.at * over_by.transpose() / (point.over * point.over)
+        by / point.over - point.at * over_by / (point.over * point.over)
     }
 }

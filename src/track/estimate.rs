@@ -1,6 +1,6 @@
 //! Position of one fire: its [`Block`] read off at the common mean, and what that rests on.
 
-use super::block::{Block, Chart, Measurement, State, Told};
+use super::block::{self, Block, Chart, Measurement, State, Told};
 use super::common::Common;
 use super::measure::{LocalGround, Look};
 use crate::alarm::Method;
@@ -26,6 +26,7 @@ pub struct Estimate {
 /// Where, and at which error, the ground was last taken in.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct GroundTaken {
+    ground: LocalGround,
     at: Vector3<f64>,
     sigma_m: f64,
 }
@@ -57,13 +58,13 @@ impl Estimate {
     /// Nothing known but the pixel: inverse depth as unknown as it can be, or within what stereo
     /// leaves when it says that it would have seen anything nearer than `at_least_m`.
     #[must_use]
-    pub fn unseen(sighting: &Sighting, lens: &Lens, terrain_sigma_m: f64) -> Self {
+    pub fn unseen(sighting: &Sighting, lens: &Lens, terrain_sigma_m: f64, common: &Common) -> Self {
         let inverse_depth = match (sighting.at_least_m, sighting.disparity) {
             (Some(least), None) if least > 0.0 => (0.5 / least, 0.5 / least),
             _ => INVERSE_DEPTH,
         };
         let ray = lens.ray_enu(sighting.base);
-        let block = Block::unseen(lens, &ray, inverse_depth, terrain_sigma_m);
+        let block = Block::unseen(lens, &ray, inverse_depth, terrain_sigma_m, common);
         Self {
             block,
             state: State::zeros(),
@@ -133,7 +134,7 @@ impl Estimate {
             return self.read_off(common, now, true);
         }
         let by_state = self.block.chart().position_by_state(&self.state);
-        let position = by_state * of_state.fixed_view::<3, 3>(0, 0) * by_state.transpose();
+        let position = by_state * of_state * by_state.transpose();
         self.covariance = (position + position.transpose()) * 0.5;
         self.read_at = Some(now);
     }
@@ -152,21 +153,21 @@ impl Estimate {
     ) -> Option<Taken> {
         let mut start = self.block.state(common);
         if let (Chart::Anchored { .. }, Some(fix)) = (self.block.chart(), fix) {
-            start[2] = 1.0 / fix.range_m;
+            start[block::INVERSE_DEPTH] = 1.0 / fix.range_m;
         }
         let ground = self.ground_that_is_due(&start, view, terrain, fix);
         let look = Look {
             sighting,
             lens,
             up: *view.up(),
-            ground: ground.map(|(ground, _)| ground),
+            ground: ground.map(|taken| taken.ground),
         };
         let (measurement, at) = look.measure(&self.block, common, start)?;
         let told = self.block.tells(&measurement, &at, common)?;
         Some(Taken {
             measurement,
             told,
-            ground: ground.map(|(_, taken)| taken),
+            ground,
             has_disparity: sighting.disparity.is_some(),
         })
     }
@@ -187,16 +188,16 @@ impl Estimate {
         }
     }
 
-    /// The ground counts when it was never taken in, and again when the position is much better
-    /// known than then or is another one: its plane is then another. Not with every look, since it is
-    /// the same ground.
+    /// The ground counts when it was never taken in, and again when the position is much better known
+    /// than then or is another one, and the plane that stood for it no longer does. Not with every
+    /// look, since it is the same ground.
     fn ground_that_is_due(
         &self,
         start: &State,
         view: &View<'_>,
         terrain: Option<&dyn Terrain>,
         fix: Option<&Fix>,
-    ) -> Option<(LocalGround, GroundTaken)> {
+    ) -> Option<GroundTaken> {
         let terrain = terrain?;
         let at = self.block.chart().position(start);
         let horizontal = match (fix, self.read_at) {
@@ -208,15 +209,20 @@ impl Estimate {
         if sigma_m > GROUND_REACH * (at - view.camera_enu).norm() {
             return None;
         }
-        let is_due = self.ground.is_none_or(|taken| {
-            sigma_m < GROUND_AGAIN * taken.sigma_m
-                || (at - taken.at).xy().norm() > GROUND_MOVED * taken.sigma_m
+        let is_news = self.ground.is_none_or(|taken| {
+            let is_other = sigma_m < GROUND_AGAIN * taken.sigma_m
+                || (at - taken.at).xy().norm() > GROUND_MOVED * taken.sigma_m;
+            is_other && !taken.ground.holds_at(&at, view, terrain)
         });
-        if !is_due {
+        if !is_news {
             return None;
         }
         let ground = LocalGround::about(&at, &horizontal, view, terrain)?;
-        Some((ground, GroundTaken { at, sigma_m }))
+        Some(GroundTaken {
+            ground,
+            at,
+            sigma_m,
+        })
     }
 }
 

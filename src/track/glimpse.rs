@@ -1,9 +1,9 @@
 //! What each fire should look like in this frame, and which sighting is which fire.
 
 use super::assign::{Candidate, assign};
-use super::block::{MEASURED, PER_FIRE};
+use super::block::MEASURED;
 use super::common::{COMMON, Common};
-use super::measure::Look;
+use super::measure::{Look, rows};
 use super::{Classified, Fire};
 use crate::locate::{Lens, SHARED, View};
 use emberfix_calib::{Eye, Rig};
@@ -43,7 +43,7 @@ pub fn all(fires: &[Fire], common: &Common, lens: &Lens, rig: &Rig) -> Vec<Glimp
         (-MARGIN * size..(1.0 + MARGIN) * size).contains(&value)
     };
     let mut glimpses = Vec::new();
-    let mut rows = Vec::new();
+    let mut all_rows = Vec::new();
     for (slot, fire) in fires.iter().enumerate().filter(|(_, fire)| fire.is_open()) {
         let block = fire.estimate.block();
         let state = block.state(common);
@@ -57,10 +57,7 @@ pub fn all(fires: &[Fire], common: &Common, lens: &Lens, rig: &Rig) -> Vec<Glimp
         let Some(linear) = lens.linear(&point) else {
             continue;
         };
-        let mut by_state = SMatrix::<f64, 3, PER_FIRE>::zeros();
-        by_state
-            .fixed_columns_mut::<3>(0)
-            .copy_from(&(linear.by_at * by + linear.by_over * over_by.transpose()));
+        let by_state = rows(&linear, &by, &over_by);
         let mut by_common = by_state * block.by_common();
         let mut now = by_common.fixed_columns_mut::<SHARED>(0);
         now += linear.by_shared;
@@ -69,9 +66,9 @@ pub fn all(fires: &[Fire], common: &Common, lens: &Lens, rig: &Rig) -> Vec<Glimp
             seen: linear.value,
             spread: by_state * block.own() * by_state.transpose(),
         });
-        rows.push(by_common);
+        all_rows.push(by_common);
     }
-    for (glimpses, rows) in glimpses.chunks_mut(BATCH).zip(rows.chunks(BATCH)) {
+    for (glimpses, rows) in glimpses.chunks_mut(BATCH).zip(all_rows.chunks(BATCH)) {
         add_common_spread(glimpses, rows, common);
     }
     glimpses

@@ -1,6 +1,8 @@
 //! A sighting as a linearised measurement of one fire: bearing, disparity, and the ground it stands on.
 
-use super::block::{Block, Chart, MEASURED, Measurement, PER_FIRE, State, TERRAIN};
+use super::block::{
+    Block, ByState, Chart, INVERSE_DEPTH, MEASURED, Measurement, PER_FIRE, State, TERRAIN,
+};
 use super::common::Common;
 use crate::locate::{Distant, Lens, Linear, Sighting, Terrain, View, range_beneath};
 use emberfix_frames::{Coordinate, Metres, MissionEnu, Vector3, Wgs84Parts};
@@ -12,6 +14,8 @@ const GROUND: usize = 3;
 
 /// How well a position can be held to the terrain model plus its offset, metres.
 const GROUND_NOISE_M: f64 = 0.1;
+/// Planes that differ by less are the same ground, metres.
+const SAME_GROUND_M: f64 = 0.3;
 /// Least step of the terrain's numeric slope, metres.
 const SLOPE_STEP_M: f64 = 2.0;
 /// Longest step of the terrain's numeric slope over the height above it.
@@ -26,7 +30,8 @@ const SMALL_STEP: f64 = 0.01;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LocalGround {
     at: Vector3<f64>,
-    up_m: f64,
+    /// Of the ground above `at`, metres.
+    height_m: f64,
     slope: (f64, f64),
     stray_m: f64,
 }
@@ -113,8 +118,8 @@ impl Look<'_> {
         &self,
         m: &mut Measurement,
         base: &Distant,
-        by: &nalgebra::Matrix3<f64>,
-        over_by: &Vector3<f64>,
+        by: &ByState,
+        over_by: &SMatrix<f64, 1, PER_FIRE>,
     ) {
         let Some(measured) = self.sighting.disparity else {
             return;
@@ -150,42 +155,47 @@ impl Look<'_> {
     }
 }
 
-/// Rows over the fire's coordinates.
-fn rows(
-    linear: &Linear,
-    by: &nalgebra::Matrix3<f64>,
-    over_by: &Vector3<f64>,
-) -> SMatrix<f64, 3, PER_FIRE> {
-    let mut rows = SMatrix::<f64, 3, PER_FIRE>::zeros();
-    rows.fixed_columns_mut::<3>(0)
-        .copy_from(&(linear.by_at * by + linear.by_over * over_by.transpose()));
-    rows
+/// Column, row, disparity over the fire's coordinates.
+#[must_use]
+pub fn rows(linear: &Linear, by: &ByState, over_by: &SMatrix<f64, 1, PER_FIRE>) -> ByState {
+    linear.by_at * by + linear.by_over * over_by
 }
 
-/// The base stands on the ground: up = terrain(east, north) + the fire's own terrain offset.
+/// The base stands on the ground: up = terrain(east, north) + the fire's own terrain offset. Taken
+/// times the inverse depth, in which it is nearly linear.
 fn take_ground(m: &mut Measurement, ground: &LocalGround, chart: &Chart, at: &State) {
-    let here = chart.position(at);
-    let (east, north) = ground.slope;
-    let up = ground.up_m + east * (here.x - ground.at.x) + north * (here.y - ground.at.y);
-    let normal = nalgebra::RowVector3::new(-east, -north, 1.0);
-    let by_state = normal * chart.position_by_state(at);
-    m.residual[GROUND] = up + at[TERRAIN] - here.z;
-    m.by_state
-        .fixed_view_mut::<1, 3>(GROUND, 0)
-        .copy_from(&by_state);
-    m.by_state[(GROUND, TERRAIN)] = -1.0;
-    m.noise[GROUND] = GROUND_NOISE_M.powi(2) + ground.stray_m.powi(2);
+    let (point, by, over_by) = chart.distant(at);
+    let normal = ground.normal().transpose();
+    let beneath = normal.dot(&ground.at.transpose()) + ground.height_m + at[TERRAIN];
+    m.residual[GROUND] = beneath * point.over - normal.dot(&point.at.transpose());
+    let mut by_state = normal * by - over_by * beneath;
+    by_state[TERRAIN] -= point.over;
+    m.by_state.set_row(GROUND, &by_state);
+    m.noise[GROUND] = (GROUND_NOISE_M.powi(2) + ground.stray_m.powi(2)) * point.over.powi(2);
 }
 
 /// Inverse depths stay in front of the camera.
 fn clamped(mut state: State, chart: &Chart) -> State {
     if let Chart::Anchored { .. } = chart {
-        state[2] = state[2].clamp(5e-4, 2.0);
+        state[INVERSE_DEPTH] = state[INVERSE_DEPTH].clamp(5e-4, 2.0);
     }
     state
 }
 
 impl LocalGround {
+    /// Upwards, of length one upwards.
+    fn normal(&self) -> Vector3<f64> {
+        Vector3::new(-self.slope.0, -self.slope.1, 1.0)
+    }
+
+    /// True when the model at `point` is where this plane puts it, to within what it strays anyway.
+    #[must_use]
+    pub fn holds_at(&self, point: &Vector3<f64>, view: &View<'_>, terrain: &dyn Terrain) -> bool {
+        let above = self.normal().dot(&(point - self.at)) - self.height_m;
+        let limit = SAME_GROUND_M + 0.5 * self.stray_m;
+        height_of_ground(point, view, terrain).is_some_and(|height| (height + above).abs() < limit)
+    }
+
     /// The ground about `point` within the horizontal error `covariance`: a plane through what the
     /// model says at the ends of the ellipse's axes, and what the model strays from that plane.
     /// `None` where the model says nothing.
@@ -196,10 +206,10 @@ impl LocalGround {
         view: &View<'_>,
         terrain: &dyn Terrain,
     ) -> Option<Self> {
-        let middle = ground_up(point, view, terrain)?;
+        let middle = height_of_ground(point, view, terrain)?;
         let limit = SLOPE_REACH * (view.camera_enu.z - point.z).abs().max(SLOPE_STEP_M);
         let ellipse = SymmetricEigen::new(*covariance);
-        let (mut slope, mut stray) = (nalgebra::Vector2::zeros(), 0.0);
+        let (mut slope, mut stray) = (nalgebra::Vector2::zeros(), 0.0_f64);
         for axis in 0..2 {
             let along = ellipse.eigenvectors.column(axis);
             let reach = (3.0 * ellipse.eigenvalues[axis].max(0.0))
@@ -207,11 +217,8 @@ impl LocalGround {
                 .clamp(SLOPE_STEP_M, limit);
             let at = |sign: f64| {
                 let step = along * (sign * reach);
-                ground_up(
-                    &(point + Vector3::new(step[0], step[1], 0.0)),
-                    view,
-                    terrain,
-                )
+                let there = point + Vector3::new(step[0], step[1], 0.0);
+                height_of_ground(&there, view, terrain)
             };
             let (Some(ahead), Some(behind)) = (at(1.0), at(-1.0)) else {
                 continue;
@@ -222,16 +229,16 @@ impl LocalGround {
         }
         Some(Self {
             at: *point,
-            up_m: middle,
+            height_m: middle,
             slope: (slope[0], slope[1]),
             stray_m: stray.sqrt(),
         })
     }
 }
 
-/// Height of the terrain model beneath a point, in the mission plane.
-fn ground_up(point: &Vector3<f64>, view: &View<'_>, terrain: &dyn Terrain) -> Option<f64> {
+/// Height of the terrain model above a point of the mission plane, metres.
+fn height_of_ground(point: &Vector3<f64>, view: &View<'_>, terrain: &dyn Terrain) -> Option<f64> {
     let place = view.place(&Coordinate::<MissionEnu>::from_metres(*point))?;
     let ground = terrain.height_at(&place)?;
-    Some(point.z + ground.m() - place.height().m())
+    Some(ground.m() - place.height().m())
 }

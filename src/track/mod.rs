@@ -345,7 +345,7 @@ impl Tracker {
             (Some(terrain), None) => terrain.sigma_m(&view.pose.place),
             (None, _) => 0.0,
         };
-        let estimate = Estimate::unseen(sighting, lens, terrain_sigma);
+        let estimate = Estimate::unseen(sighting, lens, terrain_sigma, &self.common);
         let taken = estimate.take(sighting, lens, view, terrain, &self.common, fix.as_ref())?;
         let id = self.next;
         self.next = FireId(id.0.saturating_add(1));

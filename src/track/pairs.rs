@@ -1,10 +1,11 @@
 //! Two fires or one: evidence for pairs that lie within each other's error.
 
 use super::Fire;
+use super::block::ByState;
 use super::common::Common;
 use super::glimpse::Glimpse;
 use crate::alarm::{FireId, FireState};
-use emberfix_frames::{Matrix3, ServiceTime};
+use emberfix_frames::ServiceTime;
 use nalgebra::SMatrix;
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -120,17 +121,12 @@ fn distance(a: &Fire, b: &Fire, common: &Common) -> f64 {
         let estimate = &fire.estimate;
         estimate.block().chart().position_by_state(estimate.state())
     });
-    let by = |fire: &Fire, slope: &Matrix3<f64>| {
-        slope.fixed_rows::<2>(0) * fire.estimate.block().by_common().fixed_rows::<3>(0)
-    };
-    let own = |fire: &Fire, slope: &Matrix3<f64>| {
-        let own = fire
-            .estimate
-            .block()
-            .own()
-            .fixed_view::<3, 3>(0, 0)
-            .into_owned();
-        slope.fixed_rows::<2>(0) * own * slope.fixed_rows::<2>(0).transpose()
+    let by =
+        |fire: &Fire, slope: &ByState| slope.fixed_rows::<2>(0) * fire.estimate.block().by_common();
+    let own = |fire: &Fire, slope: &ByState| {
+        slope.fixed_rows::<2>(0)
+            * fire.estimate.block().own()
+            * slope.fixed_rows::<2>(0).transpose()
     };
     let apart = by(a, &slope_a) - by(b, &slope_b);
     let mut with_common = SMatrix::<f64, 2, { super::COMMON }>::zeros();
