@@ -177,17 +177,17 @@ pub fn stage_with<'a>(scene: &Scene<'a>, wandered: &[Slow], rng: &mut ChaCha8Rng
     }
 }
 
-/// Flies one case and scores it.
+/// Flies one case and scores it; all errors are `scale` times what they usually are.
 ///
 /// # Errors
 /// [`SetupError`] when the rig is refused.
-pub fn fly(case: Case, law: Law, rng: &mut ChaCha8Rng) -> Result<Flown, SetupError> {
+pub fn fly(case: Case, law: Law, scale: f64, rng: &mut ChaCha8Rng) -> Result<Flown, SetupError> {
     let course = Course::drawn(rng, case.kind, case.slant_m, case.height_m);
-    let errors = ErrorModel::of(case.gnss, case.heading_deg);
+    let errors = ErrorModel::of(case.gnss, case.heading_deg).scaled(scale);
     let steepest = STEEPEST * case.height_m / course.ground_range_m.max(1.0);
     let slope = (rng.random_range(-1.0..1.0) * steepest.min(0.2), 0.0);
-    let ground = ground_at_datum(slope, GROUND_SIGMA_M);
-    let error_m = GROUND_SIGMA_M * normal(rng);
+    let ground = ground_at_datum(slope, scale * GROUND_SIGMA_M);
+    let error_m = ground.sigma_m * normal(rng);
     let base_m = on_ground(&ground, 0.0, 0.0, 0.0);
     let flame = Flame {
         base_m,

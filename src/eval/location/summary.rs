@@ -41,6 +41,8 @@ pub(super) fn report(options: &Options, campaign: &Campaign) -> Report {
     figures.extend(incident_figures(campaign));
     figures.extend(time_figures(campaign));
     figures.push(alarmed(&campaign.flown));
+    // A part that was not flown has nothing to say.
+    figures.retain(|figure| figure.n > 0);
     Report {
         figures,
         details: json!({
