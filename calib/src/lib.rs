@@ -102,6 +102,14 @@ impl Rig {
         file::load(path)
     }
 
+    /// Checks the text of a rig file; `origin` is what errors call it.
+    ///
+    /// # Errors
+    /// [`RigError`] that names the origin and every problem in it.
+    pub fn parse(text: &str, origin: &std::path::Path) -> Result<Self, RigError> {
+        file::parse(text, origin)
+    }
+
     /// Name of the rig, for reports.
     #[must_use]
     pub fn name(&self) -> &str {

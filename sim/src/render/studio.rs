@@ -158,6 +158,8 @@ pub struct Seen {
     pub box_px: [f64; 4],
     /// Mean over these pixels of the reciprocal depth of their flame light, 1/m, along `axis`.
     pub inverse_depth_per_m: f64,
+    /// Mean row of these pixels, raw left image.
+    pub row: f64,
     /// How many pixels.
     pub pixels: usize,
     /// Share of them whose red is saturated.
@@ -166,11 +168,13 @@ pub struct Seen {
 
 /// Flame light from which a pixel counts as flame: clearly brighter than a sunlit meadow.
 const LIT: f32 = 0.22;
+/// Nothing nearer is drawn, metres of depth.
+const NEAREST_M: f64 = 0.05;
 /// Flames are drawn this fine, hi-resolution pixels of height.
-const FINE_PX: f64 = 240.0;
+const FINE_PX: f64 = 200.0;
 const FINEST: usize = 8;
 /// Surroundings that are drawn, pixels: context and search of any matcher.
-const AROUND_PX: (usize, usize) = (160, 64);
+const AROUND_PX: (usize, usize) = (160, 48);
 /// Light outside of what is drawn.
 const UNDRAWN: u8 = 60;
 /// Sigma of the wide glow in a lens, pixels.
@@ -192,7 +196,11 @@ struct Layer {
 }
 
 enum Item {
-    Splat { seen: SeenSplat, inverse_depth: Option<f32>, texel_px: f32 },
+    Splat {
+        seen: SeenSplat,
+        inverse_depth: Option<f32>,
+        texel_px: f32,
+    },
     Stick(Stick),
 }
 
@@ -218,7 +226,11 @@ impl Studio {
     #[must_use]
     pub fn new(world: Arc<World>, camera: StereoCamera) -> Self {
         let rays = [Eye::Left, Eye::Right].map(|eye| RayGrid::new(camera.lens(eye)));
-        Self { world, camera, rays }
+        Self {
+            world,
+            camera,
+            rays,
+        }
     }
 
     /// One eye's raw image: left in colour, right in grey.
@@ -226,46 +238,49 @@ impl Studio {
     pub fn expose(&self, shot: &Shot, eye: Eye, look: &Look) -> Frame {
         let view = self.view(shot, eye, look);
         let layer = self.layer(shot, &view, None);
-        let (width, height) = (view.lens.width, view.lens.height);
-        let channels = if eye == Eye::Left { 3 } else { 1 };
-        let mut bytes = vec![UNDRAWN; width * height * channels];
-        let drawn = layer.extent.grown(AROUND_PX, view.lens);
-        let light = self.light(shot, &view, &layer, &drawn);
-        develop(&light, &drawn, &view, channels, &mut bytes);
-        let format = if channels == 3 { PixelFormat::Bgr8 } else { PixelFormat::Mono8 };
-        Frame { width: width as u32, height: height as u32, format, bytes }
+        self.developed(shot, &view, &layer)
     }
 
-    /// What the left eye truly sees of the first flame; depth counts along `axis` (east, north, up;
-    /// of unit length) from the left eye. `None` when it lights no pixel.
+    /// The left eye's raw image and what it truly sees of the first flame; depth counts along `axis`
+    /// (east, north, up; of unit length) from the left eye. `None` when the flame lights no pixel.
     #[must_use]
-    pub fn seen(&self, shot: &Shot, look: &Look, axis: &Vector3<f64>) -> Option<Seen> {
+    pub fn expose_left(
+        &self,
+        shot: &Shot,
+        look: &Look,
+        axis: &Vector3<f64>,
+    ) -> (Frame, Option<Seen>) {
         let view = self.view(shot, Eye::Left, look);
         let layer = self.layer(shot, &view, Some(axis));
-        let (mut sum, mut pixels, mut saturated) = (0.0, 0usize, 0usize);
-        let mut reach = [usize::MAX, usize::MAX, 0, 0];
-        for (index, lanes) in layer.pixels.iter().enumerate() {
-            let gain = look.gain as f32;
-            if lanes[4] * gain < LIT {
-                continue;
-            }
-            let (column, row) = layer.extent.place(index);
-            reach = [reach[0].min(column), reach[1].min(row), reach[2].max(column), reach[3].max(row)];
-            sum += f64::from(lanes[5] / lanes[4]);
-            pixels += 1;
-            saturated += usize::from(lanes[0] * gain > 1.0);
+        let seen = layer.seen(look.gain as f32);
+        (self.developed(shot, &view, &layer), seen)
+    }
+
+    fn developed(&self, shot: &Shot, view: &View, layer: &Layer) -> Frame {
+        let (width, height) = (view.lens.width, view.lens.height);
+        let (channels, format) = match view.eye {
+            Eye::Left => (3, PixelFormat::Bgr8),
+            Eye::Right => (1, PixelFormat::Mono8),
+        };
+        let mut bytes = vec![UNDRAWN; width * height * channels];
+        let drawn = layer.extent.grown(AROUND_PX, view.lens);
+        let light = self.light(shot, view, layer, &drawn);
+        develop(&light, &drawn, view, channels, &mut bytes);
+        Frame {
+            width: width as u32,
+            height: height as u32,
+            format,
+            bytes,
         }
-        let [left, top, right, bottom] = reach.map(|edge| edge as f64);
-        (pixels > 0).then(|| Seen {
-            box_px: [left, top, right + 1.0, bottom + 1.0],
-            inverse_depth_per_m: sum / pixels as f64,
-            pixels,
-            saturated: saturated as f64 / pixels as f64,
-        })
     }
 
     fn view<'a>(&'a self, shot: &Shot, eye: Eye, look: &'a Look) -> View<'a> {
-        View { eye, look, pose: self.camera.pose(eye, &shot.body), lens: self.camera.lens(eye) }
+        View {
+            eye,
+            look,
+            pose: self.camera.pose(eye, &shot.body),
+            lens: self.camera.lens(eye),
+        }
     }
 
     /// Everything before the backdrop.
@@ -275,7 +290,12 @@ impl Studio {
         let mut items = self.items(shot, view, &lens, axis);
         items.sort_by(|a, b| b.depth_m().total_cmp(&a.depth_m()));
         let fine = items.iter().map(Item::extent).reduce(|a, b| a.with(&b));
-        let fine = fine.unwrap_or(PixelBox { left: 0, top: 0, right: 1, bottom: 1 });
+        let fine = fine.unwrap_or(PixelBox {
+            left: 0,
+            top: 0,
+            right: 1,
+            bottom: 1,
+        });
         let extent = fine.coarser(fineness);
         let (columns, rows) = (extent.columns() * fineness, extent.rows() * fineness);
         let origin = (extent.left * fineness, extent.top * fineness);
@@ -283,20 +303,39 @@ impl Studio {
         for item in &items {
             item.draw(&mut lanes, origin, columns, self.world.textures());
         }
-        Layer { pixels: averaged(&lanes, columns, fineness), extent }
+        Layer {
+            pixels: averaged(&lanes, columns, fineness),
+            extent,
+        }
     }
 
-    fn items(&self, shot: &Shot, view: &View, lens: &Lens, axis: Option<&Vector3<f64>>) -> Vec<Item> {
+    fn items(
+        &self,
+        shot: &Shot,
+        view: &View,
+        lens: &Lens,
+        axis: Option<&Vector3<f64>>,
+    ) -> Vec<Item> {
         let t_s = shot.t_s + view.look.skew_s;
         let mut items = Vec::new();
         for (k, fire) in shot.fires.iter().enumerate() {
             let axis = axis.filter(|_| k == 0);
             let splats = fire.flame(t_s).splats();
-            items.extend(splats.iter().filter_map(|splat| view.item(splat, lens, axis)));
+            items.extend(
+                splats
+                    .iter()
+                    .filter_map(|splat| view.item(splat, lens, axis)),
+            );
         }
-        let puffs = shot.puffs.iter().filter(|puff| puff.only.is_none_or(|eye| eye == view.eye));
+        let puffs = shot
+            .puffs
+            .iter()
+            .filter(|puff| puff.only.is_none_or(|eye| eye == view.eye));
         items.extend(puffs.filter_map(|puff| view.item(&puff.splat(), lens, None)));
-        let sticks = shot.branches.iter().filter_map(|branch| Stick::new(branch, &view.pose, lens));
+        let sticks = shot
+            .branches
+            .iter()
+            .filter_map(|branch| Stick::new(branch, &view.pose, lens));
         items.extend(sticks.map(Item::Stick));
         items
     }
@@ -358,11 +397,15 @@ impl View<'_> {
                 splat.opacity *= 0.6;
             }
         }
-        let seen = SeenSplat::new(&splat, &self.pose, lens)?;
+        let seen = SeenSplat::beyond(NEAREST_M, &splat, &self.pose, lens)?;
         let inverse_depth =
             axis.map(|axis| (1.0 / (splat.centre_m - self.pose.origin_m).dot(axis)) as f32);
         let seen_px = seen.across_per_px();
-        Some(Item::Splat { seen, inverse_depth, texel_px: seen_px })
+        Some(Item::Splat {
+            seen,
+            inverse_depth,
+            texel_px: seen_px,
+        })
     }
 }
 
@@ -403,6 +446,36 @@ fn averaged(lanes: &[Lanes], columns: usize, fineness: usize) -> Vec<Lanes> {
 }
 
 impl Layer {
+    /// What stands in it of the target.
+    fn seen(&self, gain: f32) -> Option<Seen> {
+        let (mut sum, mut rows, mut pixels, mut saturated) = (0.0, 0.0, 0usize, 0usize);
+        let mut reach = [usize::MAX, usize::MAX, 0, 0];
+        for (index, lanes) in self.pixels.iter().enumerate() {
+            if lanes[4] * gain < LIT {
+                continue;
+            }
+            let (column, row) = self.extent.place(index);
+            reach = [
+                reach[0].min(column),
+                reach[1].min(row),
+                reach[2].max(column),
+                reach[3].max(row),
+            ];
+            sum += f64::from(lanes[5] / lanes[4]);
+            rows += row as f64;
+            pixels += 1;
+            saturated += usize::from(lanes[0] * gain > 1.0);
+        }
+        let [left, top, right, bottom] = reach.map(|edge| edge as f64);
+        (pixels > 0).then(|| Seen {
+            box_px: [left, top, right + 1.0, bottom + 1.0],
+            inverse_depth_per_m: sum / pixels as f64,
+            row: rows / pixels as f64,
+            pixels,
+            saturated: saturated as f64 / pixels as f64,
+        })
+    }
+
     fn at(&self, column: usize, row: usize) -> Option<Lanes> {
         let extent = &self.extent;
         let inside = (extent.left..extent.right).contains(&column)
@@ -433,7 +506,10 @@ impl PixelBox {
 
     /// Column and row of a pixel, row by row.
     fn place(&self, index: usize) -> (usize, usize) {
-        (self.left + index % self.columns(), self.top + index / self.columns())
+        (
+            self.left + index % self.columns(),
+            self.top + index / self.columns(),
+        )
     }
 }
 
@@ -453,7 +529,13 @@ impl Item {
     }
 
     /// Draws it over what is there.
-    fn draw(&self, lanes: &mut [Lanes], origin: (usize, usize), columns: usize, textures: &Textures) {
+    fn draw(
+        &self,
+        lanes: &mut [Lanes],
+        origin: (usize, usize),
+        columns: usize,
+        textures: &Textures,
+    ) {
         let extent = self.extent();
         let billows = match self {
             Self::Splat { texel_px, .. } => textures.billows.lod(BILLOW_SHARE * texel_px),
@@ -464,7 +546,11 @@ impl Item {
             for px in extent.left..extent.right {
                 let pixel = &mut lanes[line + px - origin.0];
                 match self {
-                    Self::Splat { seen, inverse_depth, .. } => {
+                    Self::Splat {
+                        seen,
+                        inverse_depth,
+                        ..
+                    } => {
                         let cover = seen.cover(px, py, &billows);
                         if cover > 0.002 {
                             seen.lay_over(pixel, cover, *inverse_depth);
@@ -541,12 +627,21 @@ impl<'a> BackdropView<'a> {
                     [0, 1, 2].map(|k| left.enu_from_camera.column(k).into_owned());
                 [left.origin_m + ahead * depth_m, ahead, right, down]
             }
-            Backdrop::Ground { up_m } => {
-                [Vector3::z() * up_m, -Vector3::z(), Vector3::x(), Vector3::y()]
-            }
+            Backdrop::Ground { up_m } => [
+                Vector3::z() * up_m,
+                -Vector3::z(),
+                Vector3::x(),
+                Vector3::y(),
+            ],
         };
         let rays = &studio.rays[usize::from(view.eye == Eye::Right)];
-        Self { studio, shot, view, rays, plane }
+        Self {
+            studio,
+            shot,
+            view,
+            rays,
+            plane,
+        }
     }
 
     /// Linear light of a pixel.
@@ -561,7 +656,12 @@ impl<'a> BackdropView<'a> {
         }
         let place = self.view.pose.origin_m + ray * depth - point;
         let footprint = (depth / self.view.lens.focal_px.0) as f32;
-        self.albedo(place.dot(&across) as f32, place.dot(&down) as f32, footprint).map(|a| a * light)
+        self.albedo(
+            place.dot(&across) as f32,
+            place.dot(&down) as f32,
+            footprint,
+        )
+        .map(|a| a * light)
     }
 
     fn albedo(&self, x: f32, y: f32, footprint_m: f32) -> [f32; 3] {
@@ -575,7 +675,12 @@ impl<'a> BackdropView<'a> {
             let plants = 1.6 * green - red;
             return [(0.12 + 1.5 * plants.max(0.0)) * (1.7 - 0.7 * middle) * (0.6 + 0.4 * fine); 3];
         }
-        [red, green, blue].map(|c| c * middle * fine)
+        let colour = match self.shot.backdrop {
+            // Rooms are plastered, not turfed.
+            Backdrop::Wall { .. } => [(red + green + blue) / 3.0; 3],
+            Backdrop::Ground { .. } => [red, green, blue],
+        };
+        colour.map(|c| c * middle * fine)
     }
 }
 
@@ -588,34 +693,53 @@ fn blurred(light: Vec<[f32; 3]>, columns: usize, look: &Look) -> Vec<[f32; 3]> {
     let wide = gaussian(&light, columns, GLARE_PX);
     let glare = look.glare as f32;
     let mixed = sharp.iter().zip(&wide);
-    mixed.map(|(s, w)| std::array::from_fn(|c| s[c] + glare * (w[c] - s[c]))).collect()
+    mixed
+        .map(|(s, w)| std::array::from_fn(|c| s[c] + glare * (w[c] - s[c])))
+        .collect()
 }
 
 fn gaussian(light: &[[f32; 3]], columns: usize, sigma_px: f64) -> Vec<[f32; 3]> {
-    let reach = (3.0 * sigma_px).ceil() as isize;
-    let weights: Vec<f32> =
-        (-reach..=reach).map(|k| (-0.5 * (k as f64 / sigma_px).powi(2)).exp() as f32).collect();
+    let reach = (3.0 * sigma_px).ceil() as usize;
+    let weight = |k: usize| (-0.5 * ((k as f64 - reach as f64) / sigma_px).powi(2)).exp() as f32;
+    let weights: Vec<f32> = (0..=2 * reach).map(weight).collect();
     let total: f32 = weights.iter().sum();
-    let rows = (light.len() / columns) as isize;
-    let pass = |from: &[[f32; 3]], step: (isize, isize)| -> Vec<[f32; 3]> {
-        let mut to = Vec::with_capacity(from.len());
-        for row in 0..rows {
-            for column in 0..columns as isize {
-                let mut sum = [0.0; 3];
-                for (k, weight) in (-reach..=reach).zip(&weights) {
-                    let x = (column + k * step.0).clamp(0, columns as isize - 1);
-                    let y = (row + k * step.1).clamp(0, rows - 1);
-                    let pixel = from[y as usize * columns + x as usize];
-                    for (s, p) in sum.iter_mut().zip(pixel) {
-                        *s += weight * p;
-                    }
-                }
-                to.push(sum.map(|s| s / total));
+    let weights: Vec<f32> = weights.iter().map(|weight| weight / total).collect();
+    let across: Vec<[f32; 3]> = light
+        .chunks_exact(columns)
+        .flat_map(|line| smoothed(line, &weights))
+        .collect();
+    transposed(
+        &transposed(&across, columns)
+            .chunks_exact(light.len() / columns)
+            .flat_map(|line| smoothed(line, &weights))
+            .collect::<Vec<_>>(),
+        light.len() / columns,
+    )
+}
+
+/// One line, its ends repeated, under the weights.
+fn smoothed(line: &[[f32; 3]], weights: &[f32]) -> Vec<[f32; 3]> {
+    let reach = weights.len() / 2;
+    let (first, last) = (line[0], line[line.len() - 1]);
+    let mut padded = vec![first; reach];
+    padded.extend_from_slice(line);
+    padded.resize(line.len() + 2 * reach, last);
+    let sum = |window: &[[f32; 3]]| {
+        let mut sum = [0.0; 3];
+        for (pixel, weight) in window.iter().zip(weights) {
+            for (s, p) in sum.iter_mut().zip(pixel) {
+                *s += weight * p;
             }
         }
-        to
+        sum
     };
-    pass(&pass(light, (1, 0)), (0, 1))
+    padded.windows(weights.len()).map(sum).collect()
+}
+
+fn transposed(light: &[[f32; 3]], columns: usize) -> Vec<[f32; 3]> {
+    let rows = light.len() / columns;
+    let at = |index: usize| light[index % rows * columns + index / rows];
+    (0..light.len()).map(at).collect()
 }
 
 /// Light to bytes.
@@ -627,12 +751,21 @@ fn develop(light: &[[f32; 3]], drawn: &PixelBox, view: &View, channels: usize, b
     });
     for (index, colour) in light.iter().enumerate() {
         let (column, row) = drawn.place(index);
-        let passing: f64 = look.dirt.iter().map(|smudge| smudge.passing(column, row)).product();
+        let passing: f64 = look
+            .dirt
+            .iter()
+            .map(|smudge| smudge.passing(column, row))
+            .product();
         let bits = hash(look.seed, column as u32, row as u32) as u32;
         let offset = (row * view.lens.width + column) * channels;
         let [red, green, blue] = *colour;
         let gain = (look.gain * passing) as f32;
-        sensor.expose([red, green, blue, green], gain, bits, &mut bytes[offset..offset + channels]);
+        sensor.expose(
+            [red, green, blue, green],
+            gain,
+            bits,
+            &mut bytes[offset..offset + channels],
+        );
     }
 }
 
@@ -651,8 +784,8 @@ impl RayGrid {
             (column % BLOCK) as f64 / BLOCK as f64,
             (row % BLOCK) as f64 / BLOCK as f64,
         );
-        let [a, b, c, d] = [(0, 0), (1, 0), (0, 1), (1, 1)]
-            .map(|(dx, dy)| self.tangents(left + dx, top + dy));
+        let [a, b, c, d] =
+            [(0, 0), (1, 0), (0, 1), (1, 1)].map(|(dx, dy)| self.tangents(left + dx, top + dy));
         let between = |a: f64, b: f64, c: f64, d: f64| {
             (a * (1.0 - x) + b * x) * (1.0 - y) + (c * (1.0 - x) + d * x) * y
         };
