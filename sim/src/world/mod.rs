@@ -74,19 +74,6 @@ impl FireTruth {
         let factor = (1.0 + self.growth_m_s * age / self.height_m).max(0.02);
         (age >= 0.0).then_some((self.width_m * factor, self.height_m * factor))
     }
-
-    /// How far flame reaches from the base in the direction of the unit vector `outwards` (east,
-    /// north) at a time, metres; `None` before it ignites. Of a fire that runs the width in
-    /// [`FireTruth::size_at`] is that of each of its flames.
-    #[must_use]
-    pub fn reach_m(&self, outwards: &Vector2<f64>, t_s: f64) -> Option<f64> {
-        let (width_m, _) = self.size_at(t_s)?;
-        let age_s = t_s - self.ignites_at_s;
-        let run_m = self
-            .spread
-            .map_or(0.0, |spread| spread.reach_m(outwards, age_s));
-        Some(width_m / 2.0 + run_m)
-    }
 }
 
 /// Why a world can't be.
@@ -140,6 +127,11 @@ pub(crate) struct Burning {
     pub splats: Vec<Splat>,
 }
 
+/// Moments that a reach is averaged over.
+const REACH_TIMES: u32 = 9;
+/// Share of a splat's half width at which its kernel `(1 - r²)²` is a half.
+const HALF_DENSE: f64 = 0.541;
+
 /// Light that a flame throws on the ground.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Glow {
@@ -181,6 +173,25 @@ impl World {
     #[must_use]
     pub fn fires(&self) -> &[FireTruth] {
         &self.fires
+    }
+
+    /// How far the visible flame of a fire reaches from its base in a direction (unit vector; east,
+    /// north, up) about a time, metres: the mean over two seconds before and after, as flames lick.
+    /// Flame ends where a cloud is half as dense as in its middle. `None` for what is no flame then.
+    #[must_use]
+    pub fn flame_reach_m(&self, fire: usize, direction: &Vector3<f64>, t_s: f64) -> Option<f64> {
+        let base_m = self.fires.get(fire)?.base_m;
+        let mut sum = 0.0;
+        for k in 0..REACH_TIMES {
+            let off_s = 4.0 * (f64::from(k) / f64::from(REACH_TIMES - 1) - 0.5);
+            let splats = self.flame_splats(fire, t_s + off_s)?;
+            let reaches = splats.iter().map(|splat| {
+                let half = splat.half_axis_m.dot(direction).hypot(splat.half_width_m);
+                (splat.centre_m - base_m).dot(direction) + HALF_DENSE * half
+            });
+            sum += reaches.fold(f64::NEG_INFINITY, f64::max);
+        }
+        Some(sum / f64::from(REACH_TIMES))
     }
 
     pub(crate) fn terrain(&self) -> &Terrain {

@@ -5,8 +5,8 @@
 //! has: a scale that stays for a flight (its box on its flames), and a jitter from look to look.
 //! **Poses** are reported with errors that wander. **The tracker** is stood in for by the fire's
 //! near edge with one range error per flight, drawn from the share that the assessment is told.
-//! A fire's true width is the sum of its reaches to both sides of the line of sight. Half of the
-//! fires run over the ground, the others grow where they are.
+//! True width and height are how far the visible flames reach, to both sides of the line of sight
+//! and upwards. Half of the fires run over the ground, the others grow where they are.
 
 use crate::assess::extent::{Extent, Outline, Standing, Wind};
 use crate::assess::outline::Look;
@@ -213,6 +213,12 @@ impl Scene {
         })
     }
 
+    /// How far flame reaches over the ground, metres.
+    fn reach_m(&self, outwards: &Vector2<f64>, t_s: f64) -> Option<f64> {
+        let outwards = Vector3::new(outwards.x, outwards.y, 0.0);
+        self.world.flame_reach_m(0, &outwards, t_s)
+    }
+
     /// On a circle about the fire, looking a little ahead of where the head may be.
     fn body(&self, t_s: f64) -> BodyState {
         let angle = self.start_rad + self.turn_rad_s * t_s;
@@ -368,11 +374,11 @@ impl<'a> Watch<'a> {
     }
 
     /// Where the tracker would have the near edge, in the reported plane, and how surely.
-    fn standing(&self, scene: &Scene, truth: &FireTruth) -> Option<Standing> {
+    fn standing(&self, scene: &Scene) -> Option<Standing> {
         let t_s = self.last_t_s;
         let camera = scene.body(t_s).position_m;
         let towards = camera.xy() / camera.xy().norm();
-        let near = towards * truth.reach_m(&towards, t_s)?;
+        let near = towards * scene.reach_m(&towards, t_s)?;
         let near = Vector3::new(near.x, near.y, 0.0);
         let placed = camera + (near - camera) * (1.0 + self.range_off);
         Some(Standing {
@@ -382,13 +388,13 @@ impl<'a> Watch<'a> {
     }
 
     fn outcome(&self, scene: &Scene, truth: &FireTruth, _rng: &mut ChaCha8Rng) -> Option<Outcome> {
-        let standing = self.standing(scene, truth)?;
+        let standing = self.standing(scene)?;
         let extent = self.outline.extent(&standing, scene.wind.as_ref())?;
         let t_s = self.last_t_s;
         let camera = scene.body(t_s).position_m;
         let side = Vector2::new(camera.y, -camera.x).normalize();
-        let width = truth.reach_m(&side, t_s)? + truth.reach_m(&-side, t_s)?;
-        let (_, height) = truth.size_at(t_s)?;
+        let width = scene.reach_m(&side, t_s)? + scene.reach_m(&-side, t_s)?;
+        let height = scene.world.flame_reach_m(0, &Vector3::z(), t_s)?;
         Some(Outcome::of(&extent, truth, width, height, scene))
     }
 }
