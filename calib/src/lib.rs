@@ -7,6 +7,7 @@
 //! **Assumptions.** Pinhole cameras with OpenCV's five-term distortion (k1 k2 p1 p2 k3), pixel
 //! centres at whole numbers. **Known limits.** No fisheye, no rolling-shutter model.
 
+pub mod exchange;
 mod file;
 mod nearest;
 mod page;
