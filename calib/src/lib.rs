@@ -8,6 +8,7 @@
 //! centres at whole numbers. **Known limits.** No fisheye; a rolling shutter has a time
 //! but no model.
 
+pub mod exchange;
 mod file;
 mod nearest;
 mod page;
