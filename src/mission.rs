@@ -4,9 +4,9 @@
 //! mission file. The `[sim]` table belongs to the simulator and is not read here.
 
 use crate::detect::{DetectorConfig, Family};
-use crate::locate::{SharedSigmas, Terrain};
+use crate::locate::{SharedPriors, Terrain};
 use crate::pose::PoseConfig;
-use crate::range::SgbmConfig;
+use crate::range::{HsvMask, Method, RangeConfig};
 use crate::track::TrackConfig;
 use emberfix_calib::{Checks, KeyProblem, Rig, RigError, toml_problem, unknown_keys};
 use emberfix_frames::{EllipsoidHeight, Wgs84, place_from_degrees};
@@ -74,14 +74,16 @@ pub struct Mission {
     pub camera_url: String,
     /// The detector.
     pub detector: DetectorConfig,
-    /// Stereo matching.
-    pub range: SgbmConfig,
+    /// How ranges are measured.
+    pub range_method: Method,
+    /// Numbers of ranging.
+    pub range: RangeConfig,
     /// The ground, if the mission knows it.
     pub terrain: Option<Arc<dyn Terrain>>,
     /// Defaults and limits of the pose.
     pub pose: PoseConfig,
-    /// Errors that stay the same from frame to frame.
-    pub shared: SharedSigmas,
+    /// What is known beforehand of the errors that all sightings share.
+    pub shared: SharedPriors,
     /// The tracker.
     pub track: TrackConfig,
     /// The ground agent.
@@ -157,6 +159,8 @@ struct RawModel {
 
 #[derive(Deserialize, Default)]
 struct RawRange {
+    method: Option<String>,
+    mask: Option<String>,
     max_disparity_px: Option<u32>,
     max_sigma_over_range: Option<f64>,
 }
@@ -169,21 +173,29 @@ struct RawSigma {
     gnss_floor_m: f64,
     heading_deg: f64,
     tilt_deg: f64,
+    gnss_constant_share: f64,
     gnss_correlation_s: f64,
+    heading_constant_share: f64,
     heading_correlation_s: f64,
+    tilt_constant_share: f64,
+    tilt_correlation_s: f64,
 }
 
 impl Default for RawSigma {
     fn default() -> Self {
-        let (pose, track) = (PoseConfig::default(), TrackConfig::default());
+        let (pose, shared) = (PoseConfig::default(), SharedPriors::default());
         Self {
             gnss_horizontal_m: pose.gnss_horizontal_m,
             gnss_vertical_m: pose.gnss_vertical_m,
             gnss_floor_m: pose.gnss_floor_m,
-            heading_deg: 2.0,
-            tilt_deg: 0.5,
-            gnss_correlation_s: track.gnss_correlation_s,
-            heading_correlation_s: track.heading_correlation_s,
+            heading_deg: shared.heading_rad.to_degrees(),
+            tilt_deg: shared.tilt_rad.to_degrees(),
+            gnss_constant_share: shared.gnss_constant_share,
+            gnss_correlation_s: shared.gnss_correlation_s,
+            heading_constant_share: shared.heading_constant_share,
+            heading_correlation_s: shared.heading_correlation_s,
+            tilt_constant_share: shared.tilt_constant_share,
+            tilt_correlation_s: shared.tilt_correlation_s,
         }
     }
 }
@@ -248,8 +260,10 @@ const KNOWN: &[&str] = &[
     "model.tile_px",
     "model.overlap_px",
     "model.threads",
+    "range.mask",
     "range.max_disparity_px",
     "range.max_sigma_over_range",
+    "range.method",
     "terrain.kind",
     "terrain.height_ellipsoid_m",
     "terrain.sigma_m",
@@ -267,8 +281,12 @@ const KNOWN: &[&str] = &[
     "sigma.gnss_floor_m",
     "sigma.heading_deg",
     "sigma.tilt_deg",
+    "sigma.gnss_constant_share",
     "sigma.gnss_correlation_s",
+    "sigma.heading_constant_share",
     "sigma.heading_correlation_s",
+    "sigma.tilt_constant_share",
+    "sigma.tilt_correlation_s",
     "track.confirm_sightings",
     "track.confirm_span_s",
     "track.forget_suspected_s",
@@ -402,6 +420,7 @@ fn check_numbers(checks: &mut Checks, raw: &RawMission) {
         let problem = problem.replace("num_disparities", "max_disparity_px");
         checks.problem(format!("range.{problem}"));
     }
+    check_range_names(checks, &raw.range);
 }
 
 fn check_sigma(checks: &mut Checks, sigma: &RawSigma) {
@@ -428,20 +447,20 @@ fn check_sigma(checks: &mut Checks, sigma: &RawSigma) {
         " (degrees)",
     );
     checks.range("sigma.tilt_deg", sigma.tilt_deg, 0.01, 45.0, " (degrees)");
-    checks.range(
-        "sigma.gnss_correlation_s",
-        sigma.gnss_correlation_s,
-        1.0,
-        1e6,
-        "",
-    );
-    checks.range(
-        "sigma.heading_correlation_s",
-        sigma.heading_correlation_s,
-        1.0,
-        1e6,
-        "",
-    );
+    for (key, share) in [
+        ("sigma.gnss_constant_share", sigma.gnss_constant_share),
+        ("sigma.heading_constant_share", sigma.heading_constant_share),
+        ("sigma.tilt_constant_share", sigma.tilt_constant_share),
+    ] {
+        checks.range(key, share, 0.0, 1.0, " (of the variance)");
+    }
+    for (key, seconds) in [
+        ("sigma.gnss_correlation_s", sigma.gnss_correlation_s),
+        ("sigma.heading_correlation_s", sigma.heading_correlation_s),
+        ("sigma.tilt_correlation_s", sigma.tilt_correlation_s),
+    ] {
+        checks.range(key, seconds, 1.0, 1e6, "");
+    }
 }
 
 fn build(raw: RawMission, path: &Path) -> Result<Mission, MissionError> {
@@ -475,6 +494,7 @@ fn build(raw: RawMission, path: &Path) -> Result<Mission, MissionError> {
         .map_or_else(|| Path::new(".emberfix").join(&raw.name), beside);
     Ok(Mission {
         detector: detector(&raw.model, &beside),
+        range_method: method(&raw.range).unwrap_or_default(),
         range: range(&raw.range),
         pose: PoseConfig {
             gnss_horizontal_m: raw.sigma.gnss_horizontal_m,
@@ -484,20 +504,23 @@ fn build(raw: RawMission, path: &Path) -> Result<Mission, MissionError> {
             gimbal: raw.gimbal.as_ref().map(gimbal::RawGimbal::build),
             ..PoseConfig::default()
         },
-        shared: SharedSigmas {
+        shared: SharedPriors {
+            gnss_constant_share: raw.sigma.gnss_constant_share,
+            gnss_correlation_s: raw.sigma.gnss_correlation_s,
             heading_rad: raw.sigma.heading_deg.to_radians(),
+            heading_constant_share: raw.sigma.heading_constant_share,
+            heading_correlation_s: raw.sigma.heading_correlation_s,
             tilt_rad: (raw.sigma.tilt_deg.to_radians()).hypot(
                 raw.gimbal
                     .as_ref()
                     .map_or(0.0, gimbal::RawGimbal::sigma_rad),
             ),
+            tilt_constant_share: raw.sigma.tilt_constant_share,
+            tilt_correlation_s: raw.sigma.tilt_correlation_s,
         },
         track: TrackConfig {
             confirm_sightings: raw.track.confirm_sightings,
             confirm_span_s: raw.track.confirm_span_s,
-            gnss_correlation_s: raw.sigma.gnss_correlation_s,
-            heading_correlation_s: raw.sigma.heading_correlation_s,
-            mount_correlation_s: TrackConfig::default().mount_correlation_s,
             forget_suspected_s: raw.track.forget_suspected_s,
         },
         ground: GroundLinks {
@@ -535,9 +558,40 @@ fn detector(raw: &RawModel, beside: &dyn Fn(&Path) -> PathBuf) -> DetectorConfig
     }
 }
 
-fn range(raw: &RawRange) -> SgbmConfig {
-    let usual = SgbmConfig::default();
-    SgbmConfig {
+/// Methods and masks are named, not numbered.
+fn check_range_names(checks: &mut Checks, raw: &RawRange) {
+    let methods = Method::ALL.map(Method::name).join(", ");
+    for (key, named, known, allowed) in [
+        (
+            "method",
+            &raw.method,
+            method(raw).is_some(),
+            methods.as_str(),
+        ),
+        ("mask", &raw.mask, mask(raw).is_some(), "flame, printed"),
+    ] {
+        if let (Some(name), false) = (named, known) {
+            checks.problem(format!("range.{key} is {name:?}, allowed are {allowed}"));
+        }
+    }
+}
+
+fn method(raw: &RawRange) -> Option<Method> {
+    raw.method.as_deref().and_then(Method::from_name)
+}
+
+fn mask(raw: &RawRange) -> Option<HsvMask> {
+    match raw.mask.as_deref()? {
+        "flame" => Some(HsvMask::flame()),
+        "printed" => Some(HsvMask::printed()),
+        _ => None,
+    }
+}
+
+fn range(raw: &RawRange) -> RangeConfig {
+    let usual = RangeConfig::default();
+    RangeConfig {
+        mask: mask(raw).unwrap_or(usual.mask),
         num_disparities: raw.max_disparity_px.unwrap_or(usual.num_disparities),
         max_sigma_over_range: raw
             .max_sigma_over_range

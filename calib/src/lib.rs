@@ -8,14 +8,22 @@
 //! centres at whole numbers. **Known limits.** No fisheye; a rolling shutter has a time
 //! but no model.
 
+pub mod exchange;
 mod file;
 mod nearest;
+mod page;
+mod parts;
+mod plausible;
 mod rectify;
+pub mod solve;
 #[cfg(test)]
 mod tests;
 
 pub use file::RigError;
 pub use nearest::{Checks, KeyProblem, nearest_key, toml_problem, unknown_keys};
+pub use page::{PageInput, page};
+pub use parts::{Calibrated, Mounting, RigParts, mount_angles};
+pub use plausible::{Finding, MAX_K3, MAX_TURN_DEG, Severity, implausible};
 pub use rectify::Rectification;
 
 use emberfix_frames::{
@@ -93,6 +101,8 @@ pub struct Rig {
     max_skew_s: f64,
     sigmas: RigSigmas,
     rectification: Rectification,
+    calibrated: Option<Calibrated>,
+    doubts: Vec<Finding>,
 }
 
 impl Rig {
@@ -102,6 +112,14 @@ impl Rig {
     /// [`RigError`] that names the file and every problem in it.
     pub fn load(path: &std::path::Path) -> Result<Self, RigError> {
         file::load(path)
+    }
+
+    /// Checks the text of a rig file; `origin` is what errors call it.
+    ///
+    /// # Errors
+    /// [`RigError`] that names the origin and every problem in it.
+    pub fn parse(text: &str, origin: &std::path::Path) -> Result<Self, RigError> {
+        file::parse(text, origin)
     }
 
     /// Name of the rig, for reports.
@@ -161,6 +179,16 @@ impl Rig {
     #[must_use]
     pub fn sigmas(&self) -> &RigSigmas {
         &self.sigmas
+    }
+    /// What the calibration said of itself, if the file tells.
+    #[must_use]
+    pub fn calibrated(&self) -> Option<&Calibrated> {
+        self.calibrated.as_ref()
+    }
+    /// What is implausible, yet no reason to refuse the rig.
+    #[must_use]
+    pub fn doubts(&self) -> &[Finding] {
+        &self.doubts
     }
     /// The rectified pair's geometry and the way into it.
     #[must_use]

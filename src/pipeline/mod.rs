@@ -19,11 +19,11 @@ pub use vision::{Seen, Vision};
 use crate::alarm::{Alarm, AlarmDesk, FireId, Situation};
 use crate::detect::{Detection, Detector};
 use crate::ingest::StereoPair;
-use crate::locate::{Ground, SharedSigmas, Terrain, View};
+use crate::locate::{Ground, SharedPriors, Terrain, View, fix};
 use crate::mission::Mission;
 use crate::pose::{Pose, PoseAnswer, PoseEstimator};
 use crate::range::Ranger;
-use crate::track::{Fire, Outcome, Tracker};
+use crate::track::{Classified, Fire, Outcome, Tracker};
 use emberfix_calib::Rig;
 use emberfix_frames::{
     GeoidUndulation, ServiceTime, SignedDuration, Stamped, TimeSyncSample, Wgs84, Wgs84Parts,
@@ -31,6 +31,7 @@ use emberfix_frames::{
 };
 use emberfix_mav::telemetry::{GpsRaw, TimeSyncMessage};
 use emberfix_mav::{Address, Received, SystemId, Telemetry};
+use std::cell::RefCell;
 use std::sync::Arc;
 
 /// One thing that reached the service.
@@ -77,7 +78,7 @@ pub struct Pipeline {
     rig: Arc<Rig>,
     datum: Wgs84,
     terrain: Option<Arc<dyn Terrain>>,
-    shared: SharedSigmas,
+    shared: SharedPriors,
     vision: Vision,
     poses: PoseEstimator,
     tracker: Tracker,
@@ -309,6 +310,11 @@ impl Pipeline {
             return Vec::new();
         };
         let moment = pair.at + seconds(self.rig.time_offset_s());
+        let last_needed = moment + seconds(self.tracker.looks_ahead_s());
+        if self.poses.at(last_needed, self.now) == PoseAnswer::NotYet {
+            self.waiting = Some(pair);
+            return Vec::new();
+        }
         match self.poses.at(moment, self.now) {
             PoseAnswer::NotYet => {
                 self.waiting = Some(pair);
@@ -366,13 +372,12 @@ impl Pipeline {
         if seen.mono {
             self.degraded.push(crate::pose::Degraded::Mono.name());
         }
-        let terrain = self.terrain.clone();
         let sightings: Vec<_> = seen
             .sightings
             .iter()
             .map(|(_, sighting)| *sighting)
             .collect();
-        let outcomes = self.tracker.step(&view, &sightings, terrain.as_deref());
+        let outcomes = self.track(&view, &sightings);
         let mut outputs = vec![Output::Pose(Box::new(pose.clone()))];
         for outcome in &outcomes {
             outputs.push(self.fix_output(&seen, outcome, &view));
@@ -385,17 +390,31 @@ impl Pipeline {
         outputs
     }
 
+    /// The tracker may ask where the vehicle was at other moments: the clock error is one of its states.
+    fn track(&mut self, view: &View<'_>, sightings: &[Classified]) -> Vec<Outcome> {
+        let (now, poses) = (self.now, RefCell::new(&mut self.poses));
+        let motion =
+            |later_s: f64| match poses.borrow_mut().at(view.pose.at + seconds(later_s), now) {
+                PoseAnswer::Fresh(pose) => Some(*pose),
+                _ => None,
+            };
+        let view = view.clone().with_motion(&motion);
+        self.tracker.step(&view, sightings, self.terrain.as_deref())
+    }
+
     fn fix_output(&mut self, seen: &Seen, outcome: &Outcome, view: &View<'_>) -> Output {
         let (found, classified) = &seen.sightings[outcome.index];
         let at = classified.sighting.at;
-        let situation = outcome.fix.as_ref().map(|fix| {
+        let fix = fix(&classified.sighting, view, self.terrain.as_deref());
+        let situation = fix.as_ref().map(|fix| {
             let mut situation = situate(&fix.place, &self.poses, self.terrain.as_deref());
             let reasons = self.degraded.iter().map(|reason| (*reason).to_owned());
             situation.degraded.extend(reasons);
             situation
         });
         let box_px = seen.found[*found].box_px;
-        let feature = feature::sighting(classified, outcome, box_px, situation.as_ref(), view);
+        let placed = fix.as_ref().zip(situation.as_ref());
+        let feature = feature::sighting(classified, box_px, placed, view);
         Output::Fix {
             at,
             feature: self.desk.signed(outcome.fire, feature),

@@ -1,13 +1,10 @@
 use super::*;
-use crate::locate::{SharedSigmas, View};
+use crate::locate::View;
+use crate::locate::tests::SIGMAS;
 use crate::testing::{datum, pose, rig};
 use emberfix_frames::{Coordinate, Geoid, Metres, Vector3, Wgs84Parts, place_from_degrees};
 use proptest::prelude::*;
 
-const SIGMAS: SharedSigmas = SharedSigmas {
-    heading_rad: 0.03,
-    tilt_rad: 0.005,
-};
 const EXACT: TileSigmas = TileSigmas {
     vertical_m: 0.3,
     horizontal_m: 0.0,
