@@ -589,3 +589,5 @@ fn is_near_box(sighting: &Sighting, u: f64, v: f64) -> bool {
 
 #[cfg(test)]
 mod tests;
+#[cfg(test)]
+mod probe;
