@@ -93,6 +93,8 @@ pub struct Told {
 
 /// Inverse depth below which nothing is told apart from infinity, 1/m.
 const LEAST_INVERSE_DEPTH: f64 = 2e-4;
+/// Times the variance of a way that its square must exceed to count as flown at all.
+const SURELY: f64 = 3.0;
 /// Tangents are unknown beforehand: one sigma.
 const ANY_TANGENT: f64 = 3.0;
 
@@ -173,11 +175,7 @@ impl Block {
             .map(|axis| variances[axis] * (1.0 - ray[axis] * ray[axis]))
             .sum();
         let length = across.norm_squared();
-        if length > variance {
-            1.0 - variance / length
-        } else {
-            0.0
-        }
+        (1.0 - SURELY * variance / length.max(f64::MIN_POSITIVE)).max(0.0)
     }
 
     /// Expresses what rested on replaced numbers of the common state by the new ones.

@@ -72,7 +72,8 @@ impl Look<'_> {
             let Some(step) = self.step(&m, block, &prior, &at) else {
                 break;
             };
-            let is_small = |i: usize| step[i].powi(2) <= limit * limit * block.own()[(i, i)].max(1e-18);
+            let is_small =
+                |i: usize| step[i].powi(2) <= limit * limit * block.own()[(i, i)].max(1e-18);
             if (0..PER_FIRE).all(is_small) {
                 break;
             }
@@ -123,13 +124,7 @@ impl Look<'_> {
     }
 
     /// Disparity of the flame, which was measured above the base: by how much, the pixels say.
-    fn take_disparity(
-        &self,
-        m: &mut Measurement,
-        base: &Distant,
-        chart: &Chart,
-        at: &State,
-    ) {
+    fn take_disparity(&self, m: &mut Measurement, base: &Distant, chart: &Chart, at: &State) {
         let Some(measured) = self.sighting.disparity else {
             return;
         };

@@ -589,5 +589,3 @@ fn is_near_box(sighting: &Sighting, u: f64, v: f64) -> bool {
 
 #[cfg(test)]
 mod tests;
-#[cfg(test)]
-mod probe;
