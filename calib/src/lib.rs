@@ -5,16 +5,25 @@
 //! **Out:** pixels to rectified pixels, rectified pixels to rays, camera to body.
 //!
 //! **Assumptions.** Pinhole cameras with OpenCV's five-term distortion (k1 k2 p1 p2 k3), pixel
-//! centres at whole numbers. **Known limits.** No fisheye, no rolling-shutter model.
+//! centres at whole numbers. **Known limits.** No fisheye; a rolling shutter has a time
+//! but no model.
 
+pub mod exchange;
 mod file;
 mod nearest;
+mod page;
+mod parts;
+mod plausible;
 mod rectify;
+pub mod solve;
 #[cfg(test)]
 mod tests;
 
 pub use file::RigError;
 pub use nearest::{Checks, KeyProblem, nearest_key, toml_problem, unknown_keys};
+pub use page::{PageInput, page};
+pub use parts::{Calibrated, Mounting, RigParts, mount_angles};
+pub use plausible::{Finding, MAX_K3, MAX_TURN_DEG, Severity, implausible};
 pub use rectify::Rectification;
 
 use emberfix_frames::{
@@ -88,9 +97,12 @@ pub struct Rig {
     mount: MountAngles,
     lever_arm: Vector<BodyFrd>,
     time_offset_s: f64,
+    rolling_readout_s: f64,
     max_skew_s: f64,
     sigmas: RigSigmas,
     rectification: Rectification,
+    calibrated: Option<Calibrated>,
+    doubts: Vec<Finding>,
 }
 
 impl Rig {
@@ -102,12 +114,12 @@ impl Rig {
         file::load(path)
     }
 
-    /// Checks a rig file's text that did not come from a file; `name` stands for the path in errors.
+    /// Checks the text of a rig file; `origin` is what errors call it.
     ///
     /// # Errors
-    /// [`RigError`] that names every problem in it.
-    pub fn from_toml(text: &str, name: &str) -> Result<Self, RigError> {
-        file::parse(text, std::path::Path::new(name))
+    /// [`RigError`] that names the origin and every problem in it.
+    pub fn parse(text: &str, origin: &std::path::Path) -> Result<Self, RigError> {
+        file::parse(text, origin)
     }
 
     /// Name of the rig, for reports.
@@ -153,6 +165,11 @@ impl Rig {
     pub fn time_offset_s(&self) -> f64 {
         self.time_offset_s
     }
+    /// From the exposure of the first row to that of the last, seconds; 0 for a global shutter.
+    #[must_use]
+    pub fn rolling_readout_s(&self) -> f64 {
+        self.rolling_readout_s
+    }
     /// Greatest difference of the eyes' exposures that still counts as one moment, seconds.
     #[must_use]
     pub fn max_skew_s(&self) -> f64 {
@@ -162,6 +179,16 @@ impl Rig {
     #[must_use]
     pub fn sigmas(&self) -> &RigSigmas {
         &self.sigmas
+    }
+    /// What the calibration said of itself, if the file tells.
+    #[must_use]
+    pub fn calibrated(&self) -> Option<&Calibrated> {
+        self.calibrated.as_ref()
+    }
+    /// What is implausible, yet no reason to refuse the rig.
+    #[must_use]
+    pub fn doubts(&self) -> &[Finding] {
+        &self.doubts
     }
     /// The rectified pair's geometry and the way into it.
     #[must_use]

@@ -5,7 +5,7 @@ use emberfix_calib::{RectifiedPixel, Rig};
 use emberfix_frames::{Attitude, Ecef, EllipsoidHeight, Matrix3, Vector3, Wgs84Parts, enu_offset};
 use std::f64::consts::FRAC_PI_2;
 
-const SIGMAS: SharedPriors = SharedPriors {
+pub(super) const SIGMAS: SharedPriors = SharedPriors {
     gnss_constant_share: 0.5,
     gnss_correlation_s: 100.0,
     heading_rad: 0.03,

@@ -19,15 +19,15 @@ pub use vision::{Seen, Vision};
 use crate::alarm::{Alarm, AlarmDesk, FireId, Situation};
 use crate::detect::{Detection, Detector};
 use crate::ingest::StereoPair;
-use crate::locate::{SharedPriors, Terrain, View, fix};
+use crate::locate::{Ground, SharedPriors, Terrain, View, fix};
 use crate::mission::Mission;
 use crate::pose::{Pose, PoseAnswer, PoseEstimator};
 use crate::range::Ranger;
 use crate::track::{Classified, Fire, Outcome, Tracker};
 use emberfix_calib::Rig;
 use emberfix_frames::{
-    ServiceTime, SignedDuration, Stamped, TimeSyncSample, Wgs84, Wgs84Parts, ecef_from_enu,
-    place_from_ecef, seconds,
+    GeoidUndulation, ServiceTime, SignedDuration, Stamped, TimeSyncSample, Wgs84, Wgs84Parts,
+    ecef_from_enu, place_from_ecef, seconds,
 };
 use emberfix_mav::telemetry::{GpsRaw, TimeSyncMessage};
 use emberfix_mav::{Address, Received, SystemId, Telemetry};
@@ -203,6 +203,14 @@ impl Pipeline {
         {
             self.autopilot.system = Some(received.system());
         }
+        if let Telemetry::GimbalDeviceAttitude(said) = telemetry
+            && self.autopilot.system == Some(received.system())
+        {
+            let taken = self.poses.add_gimbal(received.component(), self.now, said);
+            self.counters
+                .add("gimbal", if taken { "taken" } else { "refused" });
+            return;
+        }
         if !self.autopilot.is(received.frame.sender()) {
             self.counters.add("mavlink", "other_sender");
             return;
@@ -231,6 +239,17 @@ impl Pipeline {
                 self.counters.add("telemetry", "position");
             }
             Telemetry::GpsRaw(raw) => self.take_gnss(raw),
+            Telemetry::Gps2Raw(raw) => {
+                if let Some(separation) = separation(raw) {
+                    self.poses.add_second_separation(separation);
+                }
+                self.counters.add("telemetry", "second_gnss");
+            }
+            Telemetry::EstimatorStatus(status) => {
+                self.poses
+                    .add_vertical_validity(status.flags.vertical_position());
+                self.counters.add("telemetry", "estimator_status");
+            }
             Telemetry::SystemTime(time) if time.utc_is_absurd() => {
                 self.counters.add("mavlink_refused", "absurd_utc");
             }
@@ -239,12 +258,12 @@ impl Pipeline {
     }
 
     fn take_gnss(&mut self, raw: &GpsRaw) {
-        let separation = raw
-            .place
-            .and_then(|place| place.height.map(|height| height - place.altitude));
         let sigmas = (raw.horizontal_sigma_m, raw.vertical_sigma_m);
         self.poses
-            .add_gnss(self.now, raw.fix.is_3d(), sigmas, separation);
+            .add_gnss(self.now, raw.fix.is_3d(), sigmas, separation(raw));
+        if let Some(place) = raw.place {
+            self.poses.add_gnss_altitude(self.now, place.altitude);
+        }
         self.counters.add(
             "telemetry",
             if raw.fix.is_3d() {
@@ -315,6 +334,21 @@ impl Pipeline {
             } => self.without_pose("pose_stale", || {
                 format!("{what} is {nearest:#} away from the shutter, limit {limit:#}")
             }),
+            PoseAnswer::Conflict {
+                what,
+                apart_deg,
+                limit_deg,
+            } => self.without_pose("pose_conflict", || {
+                format!("{what} are {apart_deg:.0} degrees apart, limit {limit_deg:.0}")
+            }),
+            PoseAnswer::TooFast {
+                turned_deg,
+                limit_deg,
+            } => self.without_pose("too_fast_for_shutter", || {
+                format!(
+                    "the camera turned {turned_deg:.1} degrees within one readout, limit {limit_deg:.1}"
+                )
+            }),
             PoseAnswer::NoGnssFix => self.without_pose("no_gnss_fix", || {
                 "GNSS has no 3D fix: no positions".to_owned()
             }),
@@ -373,12 +407,9 @@ impl Pipeline {
         let at = classified.sighting.at;
         let fix = fix(&classified.sighting, view, self.terrain.as_deref());
         let situation = fix.as_ref().map(|fix| {
-            let mut situation = situate(&fix.place, &mut self.poses, self.terrain.as_deref());
-            situation.degraded = self
-                .degraded
-                .iter()
-                .map(|reason| (*reason).to_owned())
-                .collect();
+            let mut situation = situate(&fix.place, &self.poses, self.terrain.as_deref());
+            let reasons = self.degraded.iter().map(|reason| (*reason).to_owned());
+            situation.degraded.extend(reasons);
             situation
         });
         let box_px = seen.found[*found].box_px;
@@ -392,11 +423,12 @@ impl Pipeline {
 
     fn alarms(&mut self) -> Vec<Output> {
         let (datum, terrain) = (self.datum, self.terrain.clone());
-        let (poses, degraded) = (&mut self.poses, &self.degraded);
+        let (poses, degraded) = (&self.poses, &self.degraded);
         let due = self.desk.due(self.tracker.fires(), |fire| {
             let place = place_from_ecef(&ecef_from_enu(&datum).transform(fire.position()))?;
             let mut situation = situate(&place, poses, terrain.as_deref());
-            situation.degraded = degraded.iter().map(|reason| (*reason).to_owned()).collect();
+            let reasons = degraded.iter().map(|reason| (*reason).to_owned());
+            situation.degraded.extend(reasons);
             situation.degraded.extend(
                 fire.merged_into
                     .map(|into| format!("merged_into_{}", into.0)),
@@ -416,13 +448,24 @@ impl AutopilotLock {
     }
 }
 
+/// Ellipsoid height minus altitude, where a receiver gives both.
+fn separation(raw: &GpsRaw) -> Option<GeoidUndulation> {
+    raw.place
+        .and_then(|place| place.height.map(|height| height - place.altitude))
+}
+
 /// Altitude and height above ground of a place.
-fn situate(place: &Wgs84, poses: &mut PoseEstimator, terrain: Option<&dyn Terrain>) -> Situation {
-    let ground = terrain.and_then(|terrain| terrain.height_at(place));
+fn situate(place: &Wgs84, poses: &PoseEstimator, terrain: Option<&dyn Terrain>) -> Situation {
+    let (ground, degraded) = match terrain.map(|terrain| terrain.ground_at(place)) {
+        None => (None, None),
+        Some(Ground::Known { height, .. }) => (Some(height), None),
+        Some(Ground::Void) => (None, Some("terrain_void")),
+        Some(Ground::OffTiles) => (None, Some("terrain_off_tiles")),
+    };
     Situation {
         place: *place,
         altitude: place.height() - poses.undulation(place),
         above_ground: ground.map(|ground| place.height() - ground),
-        degraded: Vec::new(),
+        degraded: degraded.into_iter().map(str::to_owned).collect(),
     }
 }

@@ -34,8 +34,18 @@ pub(super) struct SeenSplat {
 
 impl SeenSplat {
     pub(super) fn new(splat: &Splat, pose: &EyePose, lens: &Lens) -> Option<Self> {
+        Self::beyond(NEAREST_M, splat, pose, lens)
+    }
+
+    /// A splat, if all of it is beyond `nearest_m` of depth.
+    pub(super) fn beyond(
+        nearest_m: f64,
+        splat: &Splat,
+        pose: &EyePose,
+        lens: &Lens,
+    ) -> Option<Self> {
         let centre = pose.see(&splat.centre_m);
-        if centre.z < NEAREST_M + splat.half_width_m {
+        if centre.z < nearest_m + splat.half_width_m {
             return None;
         }
         let middle = lens.project(&centre)?;
@@ -109,6 +119,15 @@ impl SeenSplat {
 
     #[inline]
     fn blend(&self, colour: &mut [f32; 4], cover: f32) {
+        let (added, kept) = self.given(cover);
+        for (c, own) in added.iter().enumerate() {
+            colour[c] = colour[c] * kept + own;
+        }
+    }
+
+    /// Light that it adds at a cover, and the share of the light behind that it lets through.
+    #[inline]
+    pub(super) fn given(&self, cover: f32) -> ([f32; 3], f32) {
         let alpha = self.alpha(cover);
         let (kept, added) = match self.kind {
             // Soot holds back less than it shines.
@@ -116,9 +135,12 @@ impl SeenSplat {
             SplatKind::Smoke => (1.0 - alpha, alpha),
             SplatKind::Light => (1.0, cover),
         };
-        for (c, own) in self.colour.iter().enumerate() {
-            colour[c] = colour[c] * kept + own * added;
-        }
+        (self.colour.map(|own| own * added), kept)
+    }
+
+    /// Half widths of the splat that a pixel spans.
+    pub(super) fn across_per_px(&self) -> f32 {
+        self.wide_per_px.0.hypot(self.wide_per_px.1)
     }
 }
 

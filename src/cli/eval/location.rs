@@ -19,9 +19,33 @@ pub struct LocationArguments {
     /// Ways to fly; all when none is named.
     #[arg(long, value_enum)]
     kind: Vec<Kind>,
+    /// Parts to measure; all when none is named.
+    #[arg(long, value_enum)]
+    part: Vec<Part>,
+    /// All errors times this, told and true: at 0.1 every model is nearly linear, and what is still
+    /// inconsistent is a fault, not curvature.
+    #[arg(long, default_value_t = 1.0)]
+    errors: f64,
     /// A small run: seconds, not minutes; too few flights for the bounds to mean much.
     #[arg(long)]
     quick: bool,
+}
+
+/// Parts of the measurement.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum Part {
+    /// The Monte Carlo with errors as assumed.
+    Flights,
+    /// The Monte Carlo with errors as not assumed.
+    Laws,
+    /// P3's flight.
+    P3,
+    /// Bent mounts and late clocks.
+    Mount,
+    /// One fire, and two.
+    Incidents,
+    /// Milliseconds per frame.
+    Times,
 }
 
 /// Measures and shows.
@@ -35,19 +59,25 @@ pub fn location(arguments: &LocationArguments) -> Result<(), Failure> {
 
 fn options(arguments: &LocationArguments) -> Options {
     let scale = if arguments.quick { 25 } else { 1 };
+    let when = |part: Part, count: usize| {
+        let wanted = arguments.part.is_empty() || arguments.part.contains(&part);
+        if wanted { count } else { 0 }
+    };
     let flights = (arguments.flights / scale).max(96);
+    let timed = if arguments.quick {
+        vec![1000]
+    } else {
+        vec![1000, 10_000]
+    };
     Options {
-        flights,
-        foreign_flights: flights / 10,
-        p3_flights: 4000 / scale,
-        mount_flights: 200 / scale,
-        incident_flights: 400 / scale,
-        timed_fires: if arguments.quick {
-            vec![1000]
-        } else {
-            vec![1000, 10_000]
-        },
+        flights: when(Part::Flights, flights),
+        foreign_flights: when(Part::Laws, flights / 10),
+        p3_flights: when(Part::P3, 4000 / scale),
+        mount_flights: when(Part::Mount, 200 / scale),
+        incident_flights: when(Part::Incidents, 400 / scale),
+        timed_fires: timed[..when(Part::Times, timed.len())].to_vec(),
         seed: arguments.seed,
+        errors: arguments.errors,
         kinds: if arguments.kind.is_empty() {
             Kind::ALL.to_vec()
         } else {

@@ -141,7 +141,7 @@ impl Pilot {
         let datum = place_from_degrees(DATUM.latitude_deg, DATUM.longitude_deg, height)
             .map_err(|error| SetupError::Place(error.to_string()))?;
         let kit = Kit {
-            rig: Rig::from_toml(&rig_toml(lens, errors), "evaluation")?,
+            rig: Rig::parse(&rig_toml(lens, errors), std::path::Path::new("evaluation"))?,
             datum,
             errors: *errors,
             priors: priors(errors),

@@ -53,6 +53,8 @@ pub struct Options {
     pub timed_fires: Vec<usize>,
     /// Seed of everything but times.
     pub seed: u64,
+    /// All errors of the Monte Carlo times this.
+    pub errors: f64,
     /// Ways to fly.
     pub kinds: Vec<Kind>,
 }
@@ -114,7 +116,7 @@ impl Options {
     /// [`SetupError`] when a rig is refused.
     pub fn fly(&self, law: Law, count: usize, bar: &ProgressBar) -> Result<Vec<Flown>, SetupError> {
         self.each(&format!("{law:?}"), count, bar, |index, rng| {
-            fly(Case::drawn(rng, &self.kinds, index), law, rng)
+            fly(Case::drawn(rng, &self.kinds, index), law, self.errors, rng)
         })
     }
 

@@ -109,6 +109,26 @@ impl ErrorModel {
         }
     }
 
+    /// The same with every sigma times `scale`; times and shares stay.
+    #[must_use]
+    pub fn scaled(self, scale: f64) -> Self {
+        Self {
+            gnss_horizontal_m: scale * self.gnss_horizontal_m,
+            gnss_vertical_m: scale * self.gnss_vertical_m,
+            heading_deg: scale * self.heading_deg,
+            tilt_deg: scale * self.tilt_deg,
+            boresight_deg: scale * self.boresight_deg,
+            disparity_bias_px: scale * self.disparity_bias_px,
+            clock_s: scale * self.clock_s,
+            lever_arm_m: scale * self.lever_arm_m,
+            pixel_px: scale * self.pixel_px,
+            disparity_px: scale * self.disparity_px,
+            attitude_noise_rad: scale * self.attitude_noise_rad,
+            position_noise_m: scale * self.position_noise_m,
+            ..self
+        }
+    }
+
     /// Sigmas in the order of [`Slow`].
     #[must_use]
     pub fn sigmas(&self) -> Slow {
@@ -271,8 +291,8 @@ impl Lens {
 
     /// Disparity below which a matcher has no range to tell: its sigma is a quarter of the depth.
     #[must_use]
-    pub fn least_disparity_px(&self, errors: &ErrorModel) -> f64 {
-        4.0 * errors.disparity_px
+    pub const fn least_disparity_px(&self) -> f64 {
+        4.0 * 0.25
     }
 }
 
@@ -372,12 +392,16 @@ impl TrueCamera<'_> {
             chance.pixel(1, errors.pixel_px),
         );
         let dd = chance.white(errors.disparity_px);
-        let (cu, cv, flicker) = (chance.white(0.5), chance.white(0.5), chance.white(0.3));
+        let (cu, cv, flicker) = (
+            chance.white(0.25 * errors.pixel_px),
+            chance.white(0.25 * errors.pixel_px),
+            chance.white(0.3),
+        );
         let inside =
             (0.0..IMAGE_PX.0).contains(&sight.base.x) && (0.0..IMAGE_PX.1).contains(&sight.base.y);
         let depth = self.lens.focal_px * self.lens.baseline_m / sight.base.z;
         let size = self.lens.focal_px * flame.size_m / depth;
-        let in_reach = sight.base.z >= self.lens.least_disparity_px(errors);
+        let in_reach = sight.base.z >= self.lens.least_disparity_px();
         inside.then_some(Seen {
             base_px: (sight.base.x + du, sight.base.y + dv),
             size_px: (size, size),
