@@ -36,20 +36,20 @@ const RADIAN_STEP: f64 = 1e-5;
 /// Stands for no knowledge of a disparity, px².
 const VOID_PX2: f64 = 1e12;
 
-/// Information about each flame's position from its looks, without any ground: the sightings of
-/// several flames share the wandering errors. Rows and columns: three per flame.
-#[must_use]
-pub fn information(
-    lens: &Lens,
-    errors: &ErrorModel,
-    flames: &[(Flame, Vec<BoundLook>)],
-) -> Option<DMatrix<f64>> {
+/// All sightings of several flames together: their joint covariance, wandering errors included, and
+/// how they follow the flames' positions (three columns per flame).
+struct Batch {
+    covariance: DMatrix<f64>,
+    jacobian: DMatrix<f64>,
+}
+
+fn batch(lens: &Lens, errors: &ErrorModel, flames: &[(Flame, Vec<BoundLook>)]) -> Option<Batch> {
     let rows: Vec<(usize, &BoundLook, Sensitivity)> = flames
         .iter()
         .enumerate()
         .flat_map(|(index, (flame, looks))| looks.iter().map(move |look| (index, flame, look)))
-        .filter_map(|(index, flame, look)| Some((index, look, sensitivity(lens, look, flame)?)))
-        .collect();
+        .map(|(index, flame, look)| Some((index, look, sensitivity(lens, look, flame)?)))
+        .collect::<Option<_>>()?;
     let count = 3 * rows.len();
     let mut covariance = DMatrix::<f64>::zeros(count, count);
     let mut jacobian = DMatrix::<f64>::zeros(count, 3 * flames.len());
@@ -81,9 +81,76 @@ pub fn information(
                 .copy_from(&block.transpose());
         }
     }
-    let solved = covariance.cholesky()?.solve(&jacobian);
-    Some(jacobian.transpose() * solved)
+    Some(Batch {
+        covariance,
+        jacobian,
+    })
 }
+
+/// Information about each flame's position from its looks, without any ground: the sightings of
+/// several flames share the wandering errors. Rows and columns: three per flame.
+#[must_use]
+pub fn information(
+    lens: &Lens,
+    errors: &ErrorModel,
+    flames: &[(Flame, Vec<BoundLook>)],
+) -> Option<DMatrix<f64>> {
+    let batch = batch(lens, errors, flames)?;
+    let solved = batch.covariance.cholesky()?.solve(&batch.jacobian);
+    Some(batch.jacobian.transpose() * solved)
+}
+
+/// The yardstick for estimators that go look by look: one generalised least squares solution over
+/// all looks at once, by Gauss-Newton from the truth, with the covariance of its last step. What it
+/// leaves is what curvature alone costs. `looks` hold the airframe as reported; `seen` their columns,
+/// rows and disparities (any number where there was none).
+#[must_use]
+pub fn all_at_once(
+    lens: &Lens,
+    errors: &ErrorModel,
+    truth: &Flame,
+    looks: &[BoundLook],
+    seen: &[Vector3<f64>],
+    ground: Option<(&Ground, f64)>,
+) -> Option<(Vector3<f64>, Matrix3<f64>)> {
+    let mut flame = *truth;
+    let mut covariance = Matrix3::identity();
+    for _ in 0..PASSES {
+        let batch = batch(lens, errors, &[(flame, looks.to_vec())])?;
+        let mut left = DVector::<f64>::zeros(3 * seen.len());
+        for (i, (look, seen)) in looks.iter().zip(seen).enumerate() {
+            let none = SMatrix::<f64, 6, 1>::zeros();
+            let predicted = numbers(lens, &look.state, &Slow::zeros(), &none, &flame)?;
+            left.fixed_rows_mut::<3>(3 * i)
+                .copy_from(&(seen - predicted));
+        }
+        let factor = batch.covariance.cholesky()?;
+        let mut information: Matrix3<f64> = (batch.jacobian.transpose()
+            * factor.solve(&batch.jacobian))
+        .fixed_view::<3, 3>(0, 0)
+        .into_owned();
+        let mut pull: Vector3<f64> = (batch.jacobian.transpose() * factor.solve(&left))
+            .fixed_rows::<3>(0)
+            .into_owned();
+        if let Some((ground, above_m)) = ground {
+            let normal = Vector3::new(-ground.slope.0, -ground.slope.1, 1.0);
+            // The truth is `above_m` above the known ground.
+            let height = above_m + normal.dot(&(flame.base_m - truth.base_m));
+            information += ground_information(ground);
+            pull -= normal * height / (ground.sigma_m * ground.sigma_m);
+        }
+        covariance = information.try_inverse()?;
+        let step = covariance * pull;
+        flame.base_m += step;
+        if step.norm() < 1e-4 {
+            break;
+        }
+    }
+    Some((flame.base_m, covariance))
+}
+
+/// Passes of [`all_at_once`] at most.
+const PASSES: usize = 8;
 
 /// The bound of one flame's position covariance, m²; `None` where nothing holds the position.
 #[must_use]

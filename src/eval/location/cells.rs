@@ -27,6 +27,10 @@ pub struct Cell {
     pub rmse_over_bound: Option<f64>,
     /// The same of P3's printed method, where it gives a position.
     pub printed_over_bound: Option<f64>,
+    /// The same of all looks solved at once: what curvature alone costs.
+    pub batch_over_bound: Option<f64>,
+    /// Consistency of that.
+    pub batch: Option<Consistency>,
     /// Consistency of the last alarms, observable flights.
     pub observable: Option<Consistency>,
     /// Consistency of all last alarms.
@@ -71,6 +75,13 @@ fn cell(kind: Kind, gnss: Gnss, terrain: bool, flown: &[&Flown]) -> Cell {
         alarmed_share: scored.len() as f64 / observable.len().max(1) as f64,
         rmse_over_bound: over_bound(&observable, |f| f.last.map(|l| l.error_m)),
         printed_over_bound: over_bound(&observable, |f| f.printed_m),
+        batch_over_bound: over_bound(&observable, |f| f.batch.map(|b| b.error_m)),
+        batch: consistency(
+            &observable
+                .iter()
+                .filter_map(|f| f.batch)
+                .collect::<Vec<_>>(),
+        ),
         observable: consistency(&scored),
         last: all(|f| f.last),
         first: all(|f| f.first),
@@ -119,8 +130,10 @@ pub fn cell_table(cells: &[Cell]) -> Table {
         "observable",
         "alarmed",
         "RMSE/bound",
+        "at once",
         "P3/bound",
         "ANEES",
+        "at once",
         "95 %",
         "first in 90 %",
         "last in 90 %",
@@ -143,8 +156,10 @@ fn cell_row(cell: &Cell) -> Vec<String> {
         format!("{:.2}", cell.observable_share),
         format!("{:.3}", cell.alarmed_share),
         number(cell.rmse_over_bound),
+        number(cell.batch_over_bound),
         number(cell.printed_over_bound),
         number(cell.observable.map(|o| o.anees)),
+        number(cell.batch.map(|b| b.anees)),
         cell.observable.map_or("-".to_owned(), interval),
         number(cell.first.map(|f| f.coverage90)),
         number(cell.last.map(|l| l.coverage90)),

@@ -1,6 +1,6 @@
 //! Many flights with one fire each: error, promised error, bound.
 
-use super::bound::{BoundLook, bound};
+use super::bound::{BoundLook, all_at_once, bound};
 use super::estimator::{Ground, Pilot, SetupError, ground_at_datum, on_ground};
 use super::flight::{Course, Kind, log_uniform};
 use super::law::{Draw, Law};
@@ -9,7 +9,9 @@ use super::score::{Scored, score};
 use super::truth::{
     Autopilot, ErrorModel, Flame, Gnss, Lens, Seen, Slow, TrueCamera, slow, wander,
 };
+use emberfix_frames::{Covariance, MissionEnu};
 use emberfix_sim::noise::{normal, stream};
+use emberfix_sim::state::BodyState;
 use nalgebra::Vector3;
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
@@ -92,6 +94,8 @@ pub struct Flown {
     pub bound_m: Option<f64>,
     /// Whether the bound says that the position is observable.
     pub observable: bool,
+    /// The yardstick: all looks solved at once.
+    pub batch: Option<Scored>,
     /// Error of P3's printed method, corrected, metres.
     pub printed_m: Option<f64>,
     /// Fires told of, or suspected, in the end; one would be right.
@@ -106,6 +110,8 @@ pub struct Staged<'a> {
     pub flame: Flame,
     /// The ground as known.
     pub ground: Option<Ground>,
+    /// By how much the flame stands above the known ground, metres.
+    pub above_m: f64,
     /// The looks, truth and report.
     pub looks: Vec<StagedLook<'a>>,
 }
@@ -132,6 +138,8 @@ pub struct Scene<'a> {
     pub flame: Flame,
     /// The ground as known.
     pub ground: Option<Ground>,
+    /// By how much the flame stands above it, metres.
+    pub above_m: f64,
     /// What the service is told about errors.
     pub errors: &'a ErrorModel,
     /// What they are drawn from.
@@ -173,6 +181,7 @@ pub fn stage_with<'a>(scene: &Scene<'a>, wandered: &[Slow], rng: &mut ChaCha8Rng
         lens: scene.lens,
         flame: scene.flame,
         ground: scene.ground,
+        above_m: scene.above_m,
         looks,
     }
 }
@@ -206,6 +215,7 @@ pub fn fly(case: Case, law: Law, scale: f64, rng: &mut ChaCha8Rng) -> Result<Flo
         lens,
         flame,
         ground: known,
+        above_m: error_m,
         errors: &errors,
         law,
         times_s: &times_s,
@@ -240,6 +250,8 @@ fn answer(case: Case, errors: &ErrorModel, staged: &Staged<'_>) -> Result<Flown,
     let bound_m = bound.map(|b| (b[(0, 0)] + b[(1, 1)]).sqrt());
     let allowed =
         (2.0 * errors.gnss_horizontal_m.powi(2) + (OBSERVABLE_SHARE * case.slant_m).powi(2)).sqrt();
+    let observable = bound_m.is_some_and(|bound| bound <= allowed);
+    let batch = observable.then(|| solve_at_once(errors, staged)).flatten();
     let printed = printed(&staged.lens, &told, false);
     Ok(Flown {
         case,
@@ -247,8 +259,46 @@ fn answer(case: Case, errors: &ErrorModel, staged: &Staged<'_>) -> Result<Flown,
         first,
         last,
         bound_m,
-        observable: bound_m.is_some_and(|bound| bound <= allowed),
+        observable,
+        batch,
         printed_m: printed.map(|place| (place - staged.flame.base_m).xy().norm()),
         fires,
     })
+}
+
+fn solve_at_once(errors: &ErrorModel, staged: &Staged<'_>) -> Option<Scored> {
+    let (mut looks, mut numbers) = (Vec::new(), Vec::new());
+    for look in &staged.looks {
+        let Some(seen) = look.seen else { continue };
+        let reported = look.autopilot.report(0.0);
+        let state = BodyState {
+            t_s: reported.t_s,
+            position_m: reported.position_m,
+            enu_from_body: reported.enu_from_body,
+            velocity_m_s: reported.velocity_m_s,
+            rate_rad_s: reported.rate_rad_s,
+        };
+        looks.push(BoundLook {
+            state,
+            ..look.truth
+        });
+        let (u, v) = seen.base_px;
+        numbers.push(Vector3::new(u, v, seen.disparity_px.unwrap_or(0.0)));
+    }
+    let ground = staged
+        .ground
+        .as_ref()
+        .map(|ground| (ground, staged.above_m));
+    let (place, covariance) = all_at_once(
+        &staged.lens,
+        errors,
+        &staged.flame,
+        &looks,
+        &numbers,
+        ground,
+    )?;
+    let ce90_m = Covariance::<MissionEnu>::new((covariance + covariance.transpose()) * 0.5)
+        .ok()?
+        .ce90_m();
+    score(&(place - staged.flame.base_m), &covariance, ce90_m)
 }

@@ -76,6 +76,7 @@ pub fn fly(rng: &mut ChaCha8Rng, gusty: bool) -> Result<Option<MountFlown>, Setu
             size_m: 2.0,
         },
         ground: None,
+        above_m: 0.0,
         errors: &errors,
         law: Law::Assumed,
         times_s: &times_s,

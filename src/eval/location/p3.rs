@@ -78,6 +78,7 @@ pub fn fly(rng: &mut ChaCha8Rng) -> Result<P3Flown, SetupError> {
             size_m: 1.0,
         },
         ground: None,
+        above_m: 0.0,
         errors: &errors,
         law: Law::Assumed,
         times_s: &times_s,

@@ -1,6 +1,6 @@
 //! The campaign's figures, tables and details.
 
-use super::cells::{alarms, cell_table, cells, law_row, law_table, of_kind};
+use super::cells::{Cell, LawRow, alarms, cell_table, cells, law_row, law_table, of_kind};
 use super::flight::Kind;
 use super::incidents::{FALSE_BOX, MISS, SIGMA_LOOKS, SIGMAS_APART, share_right};
 use super::law::Law;
@@ -77,14 +77,28 @@ pub(super) fn report(options: &Options, campaign: &Campaign) -> Report {
                 json!({ "fires": fires, "milliseconds": ms, "kept": kept })
             }).collect::<Vec<_>>(),
         }),
-        tables: vec![
-            cell_table(&cells),
-            law_table(&laws),
-            p3_table(&p3),
-            mount_table(&gusty, &steady),
-        ],
+        tables: tables(campaign, &cells, &laws),
         plots: plots::plots(&campaign.flown, &cells, &laws),
     }
+}
+
+/// Tables of the parts that were flown.
+fn tables(campaign: &Campaign, cells: &[Cell], laws: &[LawRow]) -> Vec<Table> {
+    let mut tables = Vec::new();
+    if !campaign.flown.is_empty() {
+        tables.push(cell_table(cells));
+    }
+    if laws.iter().skip(1).any(|law| law.flights > 0) {
+        tables.push(law_table(laws));
+    }
+    if !campaign.p3.is_empty() {
+        tables.push(p3_table(&p3::summary(&campaign.p3)));
+    }
+    if !campaign.gusty.is_empty() {
+        let steady = mount::summary(&campaign.steady);
+        tables.push(mount_table(&mount::summary(&campaign.gusty), &steady));
+    }
+    tables
 }
 
 fn most(name: &str, value: Option<f64>, unit: &'static str, limit: f64, n: usize) -> Figure {
