@@ -121,6 +121,20 @@ impl SharedPriors {
     }
 }
 
+impl SharedPriors {
+    /// Variances of how far the reported way between two moments may be from the one that was flown
+    /// (GNSS that wandered, and what is new in each frame): east, north, up, m².
+    #[must_use]
+    pub fn way_variances(&self, sigmas: &SVector<f64, SHARED>, apart_s: f64) -> [f64; 3] {
+        let wandered = 1.0 - (-apart_s.abs() / self.gnss_correlation_s).exp();
+        std::array::from_fn(|axis| {
+            let gnss = sigmas[Shared::Gnss as usize + axis];
+            let jitter = sigmas[Shared::PositionJitter as usize + axis];
+            2.0 * (gnss * gnss * wandered + jitter * jitter)
+        })
+    }
+}
+
 /// Sigmas of the two parts of an error whose whole sigma is 1.
 fn parts(constant_share: f64) -> (f64, f64) {
     let share = constant_share.clamp(0.0, 1.0);

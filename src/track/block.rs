@@ -5,15 +5,15 @@
 //!
 //! A fire starts as a direction and an inverse depth from where it was first seen (Civera, Davison,
 //! Montiel, "Inverse depth parametrization for monocular SLAM", 2008: bearings from far away are
-//! nearly linear in it) and becomes a plain position once it is held well enough.
+//! nearly linear in it), and stays one.
 
 use super::common::{COMMON, Common, Passage};
-use crate::locate::{Distant, Lens, SHARED};
+use crate::locate::{Distant, Lens, Linear, SHARED};
 use emberfix_frames::{Matrix3, Vector3};
 use nalgebra::{DMatrix, DVector, SMatrix, SVector};
 
-/// Numbers per fire: a place, by how much the ground there is above its model, and the way from the
-/// place to the fire while that is needed.
+/// Numbers per fire: where the camera was at the first sighting (east, north, up in the mission plane,
+/// metres), by how much the ground at the fire is above its model, and the way to the fire.
 pub const PER_FIRE: usize = 7;
 /// Index of the terrain's offset, metres.
 pub const TERRAIN: usize = 3;
@@ -32,20 +32,16 @@ pub type ByCommon = SMatrix<f64, PER_FIRE, COMMON>;
 pub type ByState = SMatrix<f64, 3, PER_FIRE>;
 type Own = SMatrix<f64, PER_FIRE, PER_FIRE>;
 
-/// What the coordinates mean. Places are east, north, up in the mission plane, metres.
+/// What the way's coordinates mean: right, down, forward of it; mission plane.
+///
+/// The camera's place at the first sighting is part of the state, since it has its errors: an offset
+/// of GNSS moves it and leaves the way alone, and a turned camera turns the way by the same angle,
+/// whatever the way's length turns out to be. In a plain position both would be bound to the length
+/// that was believed when they were linearised, and each better length would seem to say something
+/// of them that no sighting does.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Chart {
-    /// The place is where the camera was at the first sighting, and a way leads from there to the fire.
-    ///
-    /// The camera's place is part of the state, since it has its errors: an offset of GNSS moves it
-    /// and leaves the way alone, whatever the way's length turns out to be. Held fixed, each better
-    /// length would seem to say something of that offset, which no sighting does.
-    Anchored {
-        /// Right, down, forward of the way; mission plane.
-        axes: Matrix3<f64>,
-    },
-    /// The place is the fire's.
-    Plane,
+pub struct Chart {
+    axes: Matrix3<f64>,
 }
 
 /// A linearised sighting of one fire, whitened noise apart: rows that say nothing are zero and have
@@ -97,10 +93,10 @@ pub struct Told {
 
 /// Inverse depth below which nothing is told apart from infinity, 1/m.
 const LEAST_INVERSE_DEPTH: f64 = 2e-4;
+/// Times the variance of a way that its square must exceed to count as flown at all.
+const SURELY: f64 = 3.0;
 /// Tangents are unknown beforehand: one sigma.
 const ANY_TANGENT: f64 = 3.0;
-/// Sigma over value of the inverse depth, all errors and own ones, below which a plain position is as linear.
-const HELD: (f64, f64) = (0.2, 0.1);
 
 impl Block {
     /// Nothing known but where it was looked for: from `lens` along `ray`, at an inverse depth.
@@ -131,7 +127,7 @@ impl Block {
             .copy_from(&(lens.centre() - lens.centre_by_shared() * common.now()));
         offset[INVERSE_DEPTH] = depth;
         Self {
-            chart: Chart::Anchored { axes },
+            chart: Chart { axes },
             offset,
             by_common,
             own: Own::from_diagonal(&sigmas.component_mul(&sigmas)),
@@ -162,6 +158,24 @@ impl Block {
     #[must_use]
     pub fn by_common(&self) -> &ByCommon {
         &self.by_common
+    }
+
+    /// Share of the way from the first camera to `centre` that was surely flown, when it may be off by
+    /// `variances` (east, north, up, m²): James and Stein's, across the line of sight.
+    ///
+    /// A camera that hovers is reported to wander about by what GNSS does. The fire does not move in
+    /// the image with that; if each report counted as flown, each look would say that the fire is
+    /// far away (errors in variables; the remedy is regression calibration).
+    #[must_use]
+    pub fn flown_share(&self, state: &State, centre: &Vector3<f64>, variances: &[f64; 3]) -> f64 {
+        let flown = centre - state.fixed_rows::<3>(0);
+        let ray = self.chart.axes.column(2);
+        let across = flown - ray * ray.dot(&flown);
+        let variance: f64 = (0..3)
+            .map(|axis| variances[axis] * (1.0 - ray[axis] * ray[axis]))
+            .sum();
+        let length = across.norm_squared();
+        (1.0 - SURELY * variance / length.max(f64::MIN_POSITIVE)).max(0.0)
     }
 
     /// Expresses what rested on replaced numbers of the common state by the new ones.
@@ -226,36 +240,6 @@ impl Block {
         let all = with_common * self.by_common.transpose() + self.own;
         (all + all.transpose()) * 0.5
     }
-
-    /// Becomes a plain position when that is as linear.
-    pub fn settle(&mut self, common: &Common, covariance: &Own) -> bool {
-        let Chart::Anchored { .. } = self.chart else {
-            return false;
-        };
-        let state = self.state(common);
-        let depth = state[INVERSE_DEPTH].max(LEAST_INVERSE_DEPTH);
-        let relative = |of: &Own| of[(INVERSE_DEPTH, INVERSE_DEPTH)].max(0.0).sqrt() / depth;
-        if relative(covariance) > HELD.0 || relative(&self.own) > HELD.1 {
-            return false;
-        }
-        let mut by_state = Own::zeros();
-        by_state
-            .fixed_rows_mut::<3>(0)
-            .copy_from(&self.chart.position_by_state(&state));
-        by_state[(TERRAIN, TERRAIN)] = 1.0;
-        let mut settled = State::zeros();
-        settled
-            .fixed_rows_mut::<3>(0)
-            .copy_from(&self.chart.position(&state));
-        settled[TERRAIN] = state[TERRAIN];
-        self.chart = Chart::Plane;
-        self.by_common = by_state * self.by_common;
-        let own = by_state * self.own * by_state.transpose();
-        self.own = (own + own.transpose()) * 0.5;
-        self.offset = settled;
-        self.offset.gemv(-1.0, &self.by_common, common.mean(), 1.0);
-        true
-    }
 }
 
 impl Chart {
@@ -264,16 +248,12 @@ impl Chart {
     pub fn distant(&self, state: &State) -> (Distant, ByState, SMatrix<f64, 1, PER_FIRE>) {
         let place = state.fixed_rows::<3>(0).into_owned();
         let (mut by, mut over_by) = (ByState::zeros(), SMatrix::<f64, 1, PER_FIRE>::zeros());
-        let Self::Anchored { axes } = self else {
-            by.fixed_columns_mut::<3>(0).copy_from(&Matrix3::identity());
-            return (Distant::near(place), by, over_by);
-        };
         let over = state[INVERSE_DEPTH].max(LEAST_INVERSE_DEPTH);
-        let at = place * over + axes * Vector3::new(state[WAY], state[WAY + 1], 1.0);
+        let at = place * over + self.axes * Vector3::new(state[WAY], state[WAY + 1], 1.0);
         by.fixed_columns_mut::<3>(0)
             .copy_from(&(Matrix3::identity() * over));
         by.fixed_columns_mut::<2>(WAY)
-            .copy_from(&axes.fixed_columns::<2>(0));
+            .copy_from(&self.axes.fixed_columns::<2>(0));
         by.set_column(INVERSE_DEPTH, &place);
         over_by[INVERSE_DEPTH] = 1.0;
         (Distant { at, over }, by, over_by)
@@ -284,6 +264,22 @@ impl Chart {
     pub fn position(&self, state: &State) -> Vector3<f64> {
         let (point, _, _) = self.distant(state);
         point.at / point.over
+    }
+
+    /// The point's `over` slopes as if only a `share` of the way from the first camera to `centre`
+    /// had been flown (see [`Block::flown_share`]).
+    #[must_use]
+    pub fn slopes(
+        &self,
+        linear: &Linear,
+        state: &State,
+        centre: &Vector3<f64>,
+        share: f64,
+    ) -> ByState {
+        let (_, by, over_by) = self.distant(state);
+        let place = state.fixed_rows::<3>(0).into_owned();
+        let not_flown = linear.by_at * (centre - place) * (1.0 - share);
+        linear.by_at * by + (linear.by_over + not_flown) * over_by
     }
 
     /// Position over the coordinates.

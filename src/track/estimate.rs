@@ -1,6 +1,6 @@
 //! Position of one fire: its [`Block`] read off at the common mean, and what that rests on.
 
-use super::block::{self, Block, Chart, Measurement, State, Told};
+use super::block::{self, Block, Measurement, State, Told};
 use super::common::Common;
 use super::measure::{LocalGround, Look};
 use crate::alarm::Method;
@@ -20,6 +20,7 @@ pub struct Estimate {
     read_at: Option<ServiceTime>,
     methods: BTreeSet<Method>,
     first_sight: Vector3<f64>,
+    first_at: ServiceTime,
     ground: Option<GroundTaken>,
 }
 
@@ -73,6 +74,7 @@ impl Estimate {
             read_at: None,
             methods: BTreeSet::new(),
             first_sight: ray,
+            first_at: sighting.at,
             ground: None,
         }
     }
@@ -130,9 +132,6 @@ impl Estimate {
             return;
         }
         let of_state = self.block.covariance(common.covariance());
-        if self.block.settle(common, &of_state) {
-            return self.read_off(common, now, true);
-        }
         let by_state = self.block.chart().position_by_state(&self.state);
         let position = by_state * of_state * by_state.transpose();
         self.covariance = (position + position.transpose()) * 0.5;
@@ -152,7 +151,7 @@ impl Estimate {
         fix: Option<&Fix>,
     ) -> Option<Taken> {
         let mut start = self.block.state(common);
-        if let (Chart::Anchored { .. }, Some(fix)) = (self.block.chart(), fix) {
+        if let Some(fix) = fix {
             start[block::INVERSE_DEPTH] = 1.0 / fix.range_m;
         }
         let ground = self.ground_that_is_due(&start, view, terrain, fix);
@@ -161,6 +160,7 @@ impl Estimate {
             lens,
             up: *view.up(),
             ground: ground.map(|taken| taken.ground),
+            flown_share: self.flown_share(lens, view, common),
         };
         let (measurement, at) = look.measure(&self.block, common, start)?;
         let told = self.block.tells(&measurement, &at, common)?;
@@ -170,6 +170,13 @@ impl Estimate {
             ground,
             has_disparity: sighting.disparity.is_some(),
         })
+    }
+
+    fn flown_share(&self, lens: &Lens, view: &View<'_>, common: &Common) -> f64 {
+        let since_s = (view.pose.at - self.first_at).as_secs_f64();
+        let variances = view.priors().way_variances(view.sigmas(), since_s);
+        let state = self.block.state(common);
+        self.block.flown_share(&state, lens.centre(), &variances)
     }
 
     /// Takes in what was linearised, given the common mean that it was linearised at.

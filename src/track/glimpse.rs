@@ -3,7 +3,7 @@
 use super::assign::{Candidate, assign};
 use super::block::MEASURED;
 use super::common::{COMMON, Common};
-use super::measure::{Look, rows};
+use super::measure::Look;
 use super::{Classified, Fire};
 use crate::locate::{Lens, SHARED, View};
 use emberfix_calib::{Eye, Rig};
@@ -47,7 +47,7 @@ pub fn all(fires: &[Fire], common: &Common, lens: &Lens, rig: &Rig) -> Vec<Glimp
     for (slot, fire) in fires.iter().enumerate().filter(|(_, fire)| fire.is_open()) {
         let block = fire.estimate.block();
         let state = block.state(common);
-        let (point, by, over_by) = block.chart().distant(&state);
+        let (point, _, _) = block.chart().distant(&state);
         let is_near = |seen: &crate::locate::Predicted| {
             near(seen.pixel.u, width) && near(seen.pixel.v, height)
         };
@@ -57,7 +57,7 @@ pub fn all(fires: &[Fire], common: &Common, lens: &Lens, rig: &Rig) -> Vec<Glimp
         let Some(linear) = lens.linear(&point) else {
             continue;
         };
-        let by_state = rows(&linear, &by, &over_by);
+        let by_state = block.chart().slopes(&linear, &state, lens.centre(), 1.0);
         let mut by_common = by_state * block.by_common();
         let mut now = by_common.fixed_columns_mut::<SHARED>(0);
         now += linear.by_shared;
@@ -143,6 +143,7 @@ fn match_cost(
         lens,
         up: *view.up(),
         ground: None,
+        flown_share: 1.0,
     };
     let m = look.linearise(fire.estimate.block().chart(), fire.estimate.state())?;
     let has_disparity = m.by_state.row(MEASURED - 2).iter().any(|by| *by != 0.0);

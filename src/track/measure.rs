@@ -6,7 +6,7 @@ use super::block::{
 use super::common::Common;
 use crate::locate::{Distant, Lens, Linear, Sighting, Terrain, View, range_beneath};
 use emberfix_frames::{Coordinate, Metres, MissionEnu, Vector3, Wgs84Parts};
-use nalgebra::{Matrix2, SMatrix, SymmetricEigen};
+use nalgebra::{Matrix2, SymmetricEigen};
 
 /// Rows of a [`Measurement`].
 const DISPARITY: usize = 2;
@@ -22,7 +22,8 @@ const SLOPE_STEP_M: f64 = 2.0;
 const SLOPE_REACH: f64 = 10.0;
 /// Passes of the search for the fire's most likely state.
 const PASSES: usize = 8;
-/// Steps smaller than this, in units of the state's own sigmas, end the search.
+/// Steps larger than this, in units of the state's own sigmas, begin the search; smaller ones end it.
+const LARGE_STEP: f64 = 0.7;
 const SMALL_STEP: f64 = 0.01;
 
 /// The ground about a fire, as a plane: what its height is at a place, how it slopes, and how far
@@ -47,10 +48,15 @@ pub struct Look<'a> {
     pub up: Vector3<f64>,
     /// The ground, when its time has come.
     pub ground: Option<LocalGround>,
+    /// Share of the way since the first sighting that was surely flown.
+    pub flown_share: f64,
 }
 
 impl Look<'_> {
-    /// Linearised where the fire most likely is, the common errors being at their mean: and that state.
+    /// Linearised at `from`, the common errors being at their mean, and the state that this was at.
+    /// When the sighting moves the fire by much of its own sigmas, it is linearised where the fire then
+    /// most likely is; but not otherwise, since slopes that follow each sighting's own noise are
+    /// not independent of it.
     #[must_use]
     pub fn measure(
         &self,
@@ -61,21 +67,21 @@ impl Look<'_> {
         let prior = block.state(common);
         let mut at = from;
         let mut m = self.linearise(block.chart(), &at)?;
+        let mut limit = LARGE_STEP;
         for _ in 0..PASSES {
             let Some(step) = self.step(&m, block, &prior, &at) else {
                 break;
             };
-            let next = clamped(at + step, block.chart());
+            let is_small =
+                |i: usize| step[i].powi(2) <= limit * limit * block.own()[(i, i)].max(1e-18);
+            if (0..PER_FIRE).all(is_small) {
+                break;
+            }
+            let next = clamped(at + step);
             let Some(better) = self.linearise(block.chart(), &next) else {
                 break;
             };
-            let moved = next - at;
-            (at, m) = (next, better);
-            let small = (0..PER_FIRE)
-                .all(|i| moved[i].powi(2) <= SMALL_STEP.powi(2) * block.own()[(i, i)].max(1e-18));
-            if small {
-                break;
-            }
+            (at, m, limit) = (next, better, SMALL_STEP);
         }
         Some((m, at))
     }
@@ -94,10 +100,10 @@ impl Look<'_> {
     /// Linearised at one state of the fire.
     #[must_use]
     pub fn linearise(&self, chart: &Chart, at: &State) -> Option<Measurement> {
-        let (point, by, over_by) = chart.distant(at);
+        let (point, _, _) = chart.distant(at);
         let linear = self.lens.linear(&point)?;
         let mut m = Measurement::silent();
-        let seen = rows(&linear, &by, &over_by);
+        let seen = self.slopes(chart, &linear, at);
         let pixel = [self.sighting.base.u, self.sighting.base.v];
         let sigma = [self.sighting.base_sigma_px.0, self.sighting.base_sigma_px.1];
         for row in 0..2 {
@@ -106,21 +112,19 @@ impl Look<'_> {
             m.by_shared.set_row(row, &linear.by_shared.row(row));
             m.noise[row] = sigma[row] * sigma[row];
         }
-        self.take_disparity(&mut m, &point, &by, &over_by);
+        self.take_disparity(&mut m, &point, chart, at);
         if let Some(ground) = &self.ground {
             take_ground(&mut m, ground, chart, at);
         }
         Some(m)
     }
 
+    fn slopes(&self, chart: &Chart, linear: &Linear, at: &State) -> ByState {
+        chart.slopes(linear, at, self.lens.centre(), self.flown_share)
+    }
+
     /// Disparity of the flame, which was measured above the base: by how much, the pixels say.
-    fn take_disparity(
-        &self,
-        m: &mut Measurement,
-        base: &Distant,
-        by: &ByState,
-        over_by: &SMatrix<f64, 1, PER_FIRE>,
-    ) {
+    fn take_disparity(&self, m: &mut Measurement, base: &Distant, chart: &Chart, at: &State) {
         let Some(measured) = self.sighting.disparity else {
             return;
         };
@@ -130,7 +134,7 @@ impl Look<'_> {
         let Some(linear) = self.lens.linear(&flame) else {
             return;
         };
-        let seen = rows(&linear, by, over_by);
+        let seen = self.slopes(chart, &linear, at);
         m.residual[DISPARITY] = measured.px - linear.value[DISPARITY];
         m.by_state.set_row(DISPARITY, &seen.row(DISPARITY));
         m.by_shared
@@ -155,12 +159,6 @@ impl Look<'_> {
     }
 }
 
-/// Column, row, disparity over the fire's coordinates.
-#[must_use]
-pub fn rows(linear: &Linear, by: &ByState, over_by: &SMatrix<f64, 1, PER_FIRE>) -> ByState {
-    linear.by_at * by + linear.by_over * over_by
-}
-
 /// The base stands on the ground: up = terrain(east, north) + the fire's own terrain offset. Taken
 /// times the inverse depth, in which it is nearly linear.
 fn take_ground(m: &mut Measurement, ground: &LocalGround, chart: &Chart, at: &State) {
@@ -175,10 +173,8 @@ fn take_ground(m: &mut Measurement, ground: &LocalGround, chart: &Chart, at: &St
 }
 
 /// Inverse depths stay in front of the camera.
-fn clamped(mut state: State, chart: &Chart) -> State {
-    if let Chart::Anchored { .. } = chart {
-        state[INVERSE_DEPTH] = state[INVERSE_DEPTH].clamp(5e-4, 2.0);
-    }
+fn clamped(mut state: State) -> State {
+    state[INVERSE_DEPTH] = state[INVERSE_DEPTH].clamp(5e-4, 2.0);
     state
 }
 
