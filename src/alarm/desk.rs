@@ -1,6 +1,6 @@
 //! When a fire is told, and when told again.
 
-use super::{Alarm, AlarmProperties, FireId, FireState};
+use super::{Advice, Alarm, AlarmProperties, FireId, FireState};
 use crate::track::Fire;
 use emberfix_frames::{
     Covariance, HeightAboveGround, MissionEnu, MslAltitude, ServiceTime, Wgs84, enu_offset,
@@ -16,6 +16,8 @@ pub struct Situation {
     pub altitude: MslAltitude,
     /// Above the terrain model, where one is known.
     pub above_ground: Option<HeightAboveGround>,
+    /// Which way to fly so that its ellipse shrinks most.
+    pub advice: Option<Advice>,
     /// Reasons why the ellipse is wider than it could be.
     pub degraded: Vec<String>,
 }
@@ -160,6 +162,7 @@ impl AlarmDesk {
                 range_m: fire.range_m,
                 size_m: fire.size_m,
                 trend: None,
+                advice: situation.advice,
                 degraded: situation.degraded,
             },
         }

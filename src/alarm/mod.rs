@@ -65,6 +65,17 @@ pub struct SizeM {
     pub height: f64,
 }
 
+/// A course that makes a position better.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Advice {
+    /// Course over ground to fly, degrees clockwise from north, 0 to 360.
+    pub course_deg: f64,
+    /// How far, metres.
+    pub distance_m: f64,
+    /// CE90 to be expected then, metres.
+    pub ce90_m: f64,
+}
+
 /// One revision of one fire's alarm. Serialised by [`Alarm::to_geojson`], read by
 /// [`Alarm::from_geojson`]; field meanings are the contract's (`README.md`, "The alarm").
 #[derive(Debug, Clone, PartialEq)]
@@ -116,6 +127,9 @@ pub struct AlarmProperties {
     pub size_m: Option<SizeM>,
     /// How the fire changes (slope of its relative size, per second), if known.
     pub trend: Option<f64>,
+    /// Which way to fly so that the ellipse shrinks most; absent when nothing is worth it.
+    #[serde(default)]
+    pub advice: Option<Advice>,
     /// Reasons why the ellipse is wider than it could be; empty when all is well.
     pub degraded: Vec<String>,
 }

@@ -385,7 +385,7 @@ impl Pipeline {
             at: pair.at,
             found: seen.found,
         });
-        outputs.extend(self.alarms());
+        outputs.extend(self.alarms(&view));
         outputs
     }
 
@@ -419,12 +419,13 @@ impl Pipeline {
         }
     }
 
-    fn alarms(&mut self) -> Vec<Output> {
+    fn alarms(&mut self, view: &View<'_>) -> Vec<Output> {
         let (datum, terrain) = (self.datum, self.terrain.clone());
-        let (poses, degraded) = (&self.poses, &self.degraded);
-        let due = self.desk.due(self.tracker.fires(), |fire| {
+        let (poses, degraded, tracker) = (&self.poses, &self.degraded, &self.tracker);
+        let due = self.desk.due(tracker.fires(), |fire| {
             let place = place_from_ecef(&ecef_from_enu(&datum).transform(fire.position()))?;
             let mut situation = situate(&place, poses, terrain.as_deref());
+            situation.advice = tracker.advise(fire, view);
             let reasons = degraded.iter().map(|reason| (*reason).to_owned());
             situation.degraded.extend(reasons);
             situation.degraded.extend(
@@ -462,6 +463,7 @@ fn situate(place: &Wgs84, poses: &PoseEstimator, terrain: Option<&dyn Terrain>) 
     };
     Situation {
         place: *place,
+        advice: None,
         altitude: place.height() - poses.undulation(place),
         above_ground: ground.map(|ground| place.height() - ground),
         degraded: degraded.into_iter().map(str::to_owned).collect(),

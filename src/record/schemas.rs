@@ -50,6 +50,15 @@ pub(super) const ALARM: &str = r#"{
           "properties": {"width": {"type": "number"}, "height": {"type": "number"}}
         },
         "trend": {"type": ["number", "null"]},
+        "advice": {
+          "type": ["object", "null"],
+          "required": ["course_deg", "distance_m", "ce90_m"],
+          "properties": {
+            "course_deg": {"type": "number", "minimum": 0, "maximum": 360},
+            "distance_m": {"type": "number", "minimum": 0},
+            "ce90_m": {"type": "number", "minimum": 0}
+          }
+        },
         "degraded": {"type": "array", "items": {"type": "string"}}
       }
     }

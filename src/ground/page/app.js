@@ -350,6 +350,7 @@ function entry(feature) {
     ["Height", heights(feature)],
     ["Size", p.size_m && `${metres(p.size_m.width)} wide, ${metres(p.size_m.height)} high`],
     ["Based on", basis(p)],
+    ["To place it better", p.advice && `fly ${metres(p.advice.distance_m)} on course ${String(Math.round(p.advice.course_deg)).padStart(3, "0")}°: CE90 about ${metres(p.advice.ce90_m)}`],
   ]));
   if (p.degraded.length) {
     const same = (reason) => reason.match(/^merged_into_(\d+)$/)?.[1];
