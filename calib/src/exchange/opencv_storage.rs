@@ -69,7 +69,7 @@ fn open(path: &Path) -> Result<FileStorage, ImportError> {
     let syntax = |error: opencv::Error| ImportError::Syntax {
         path: path.to_owned(),
         format: FORMAT,
-        problem: error.message.replace('\n', " "),
+        problem: what_it_said(&error),
     };
     let store = FileStorage::new(&text, FileStorage_READ | FileStorage_MEMORY, "").map_err(syntax)?;
     if store.is_opened().map_err(syntax)? {
@@ -80,6 +80,13 @@ fn open(path: &Path) -> Result<FileStorage, ImportError> {
         format: FORMAT,
         problem: "it holds nothing".to_owned(),
     })
+}
+
+/// The end of OpenCV's message: before it stand its version, its source file and its function.
+fn what_it_said(error: &opencv::Error) -> String {
+    let message = error.message.replace('\n', " ");
+    let said = message.rsplit("in function").next().unwrap_or_default();
+    format!("line {}", said.trim_matches([' ', '\'', '(']).replacen("):", ":", 1))
 }
 
 impl Stores<'_> {

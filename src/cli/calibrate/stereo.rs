@@ -77,7 +77,7 @@ pub fn stereo(arguments: &StereoArguments) -> Result<(), Failure> {
     tell(arguments, &looked, &calibration)?;
     if let Some(path) = &arguments.report {
         let html = report(arguments, &pairs, &calibration)?;
-        write(path, &html)?;
+        super::write(path, &html)?;
     }
     if calibration.is_refused() {
         return Err(Failure::Refused(anyhow!(
@@ -389,13 +389,6 @@ fn report(
     page(&input).map_err(Failure::failed)
 }
 
-fn write(path: &std::path::Path, text: &str) -> Result<(), Failure> {
-    std::fs::write(path, text)
-        .map_err(|error| Failure::Failed(anyhow!("{}: {error}", path.display())))?;
-    eprintln!("written: {}", path.display());
-    Ok(())
-}
-
 /// A fresh calibration still drifts with warmth and knocks; nobody has measured less.
 const LEAST_DISPARITY_BIAS_PX: f64 = 0.02;
 
@@ -425,5 +418,5 @@ fn write_rig(
         }),
     };
     parts.check(path).map_err(Failure::refused)?;
-    write(path, &parts.to_toml())
+    super::write(path, &parts.to_toml())
 }
