@@ -2,8 +2,8 @@
 
 use super::mounting::{Known, MountingArguments};
 use crate::cli::Failure;
-use emberfix_calib::exchange::{Answers, ImuAxes, LengthUnit, import as read};
 use emberfix_calib::RigParts;
+use emberfix_calib::exchange::{Answers, ImuAxes, LengthUnit, import as read};
 use std::path::PathBuf;
 
 /// A rig from a file of Kalibr, ROS, OpenCV or DepthAI.

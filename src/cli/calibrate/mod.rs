@@ -3,7 +3,6 @@
 mod boresight;
 mod export;
 mod import;
-mod live;
 mod mounting;
 mod pairs;
 mod range;

@@ -45,7 +45,8 @@ fn chess_a(arguments: &CalibrationArguments) -> Option<PathBuf> {
     if arguments.chess_a.is_some() {
         return arguments.chess_a.clone();
     }
-    let shared = std::env::var_os("EMBERFIX_SHARED").map_or_else(|| "../shared".into(), PathBuf::from);
+    let shared =
+        std::env::var_os("EMBERFIX_SHARED").map_or_else(|| "../shared".into(), PathBuf::from);
     let folder = shared.join("data/stereo/chess_a");
     if folder.is_dir() {
         return Some(folder);

@@ -127,25 +127,28 @@ pub fn render(
     let background = 0.5 * (sight.grey.0 + sight.grey.1);
     let tilt = random.random_range(-0.15..0.15);
     let mut pixels = vec![0.0_f32; width * height];
-    for row in 0..height {
-        for column in 0..width {
-            let light = 1.0 + tilt * (column as f64 / width as f64 - 0.5);
-            let [ray, by_column, by_row] = rays.with_slopes(column, row);
-            let grey = if near_board(&to_board, scale, board, ray) {
-                sampled(&to_board, scale, board, [ray, by_column, by_row], sight, background)
-            } else {
-                background
-            };
-            pixels[row * width + column] = (grey * light) as f32;
-        }
+    for (index, pixel) in pixels.iter_mut().enumerate() {
+        let (column, row) = (index % width, index / width);
+        let light = 1.0 + tilt * (column as f64 / width as f64 - 0.5);
+        let grey = if near_board(&to_board, scale, board, rays.at(column, row)) {
+            let slopes = rays.with_slopes(column, row);
+            sampled(&to_board, scale, board, slopes, sight, background)
+        } else {
+            background
+        };
+        *pixel = (grey * light) as f32;
     }
     finish(&pixels, height as i32, sight, random)
 }
 
+/// In squares from the first inner corner.
 fn on_board(to_board: &Matrix3<f64>, scale: f64, (x, y): (f64, f64)) -> (f64, f64) {
-    let hit = to_board * Vector3::new(x, y, 1.0);
-    // In squares from the first inner corner.
-    (hit.x / (hit.z * scale), hit.y / (hit.z * scale))
+    let m = to_board.as_slice();
+    let scale = ((m[2] * x + m[5] * y + m[8]) * scale).recip();
+    (
+        (m[0] * x + m[3] * y + m[6]) * scale,
+        (m[1] * x + m[4] * y + m[7]) * scale,
+    )
 }
 
 fn near_board(to_board: &Matrix3<f64>, scale: f64, board: &Board, ray: (f64, f64)) -> bool {
@@ -182,7 +185,8 @@ fn sampled(
 fn grey_at((a, b): (f64, f64), board: &Board, sight: Sight, background: f64) -> f64 {
     let (columns, rows) = (board.columns as f64, board.rows as f64);
     let within = |margin: f64| {
-        (-1.0 - margin..columns + margin).contains(&a) && (-1.0 - margin..rows + margin).contains(&b)
+        (-1.0 - margin..columns + margin).contains(&a)
+            && (-1.0 - margin..rows + margin).contains(&b)
     };
     if !within(MARGIN) {
         background
@@ -193,12 +197,7 @@ fn grey_at((a, b): (f64, f64), board: &Board, sight: Sight, background: f64) -> 
     }
 }
 
-fn finish(
-    pixels: &[f32],
-    rows: i32,
-    sight: Sight,
-    random: &mut impl Rng,
-) -> opencv::Result<Mat> {
+fn finish(pixels: &[f32], rows: i32, sight: Sight, random: &mut impl Rng) -> opencv::Result<Mat> {
     let sharp = Mat::from_slice(pixels)?;
     let sharp = sharp.reshape(1, rows)?;
     let mut soft = Mat::default();

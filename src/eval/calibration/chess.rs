@@ -136,13 +136,26 @@ impl ChessA {
                         1e3 * self.solution.baseline_sigma_m()
                     ),
                 ),
-                row("baseline of random halves, spread, mm", format!("{:.3}", self.spread_mm)),
-                row("the half that is farthest off, mm", format!("{:.3}", self.widest_mm)),
+                row(
+                    "baseline of random halves, spread, mm",
+                    format!("{:.3}", self.spread_mm),
+                ),
+                row(
+                    "the same over root two, to hold against the sigma, mm",
+                    format!("{:.3}", self.spread_mm / std::f64::consts::SQRT_2),
+                ),
+                row(
+                    "the half that is farthest off, mm",
+                    format!("{:.3}", self.widest_mm),
+                ),
                 row(
                     "focal length, left, px",
                     format!("{:.2} ± {:.2}", self.solution.left.focal_px.0, sigmas[0]),
                 ),
-                row("sigmas widened by", format!("{:.2}", self.solution.widened_by)),
+                row(
+                    "sigmas widened by",
+                    format!("{:.2}", self.solution.widened_by),
+                ),
             ],
         }
     }

@@ -53,10 +53,7 @@ pub enum CalibrationEvalError {
 ///
 /// # Errors
 /// [`CalibrationEvalError`].
-pub fn measure(
-    options: &Options,
-    done: impl Fn() + Sync,
-) -> Result<Report, CalibrationEvalError> {
+pub fn measure(options: &Options, done: impl Fn() + Sync) -> Result<Report, CalibrationEvalError> {
     let outcomes: Vec<Outcome> = (0..options.rigs)
         .into_par_iter()
         .map(|number| {
@@ -89,7 +86,10 @@ pub fn measure(
 fn simulated_figures(outcomes: &[Outcome]) -> Vec<Figure> {
     let pulls: Vec<f64> = outcomes.iter().flat_map(Outcome::pulls).collect();
     let within = pulls.iter().filter(|pull| pull.abs() <= 2.0).count() as f64 / pulls.len() as f64;
-    let squares: f64 = outcomes.iter().map(|outcome| outcome.range_bias.powi(2)).sum();
+    let squares: f64 = outcomes
+        .iter()
+        .map(|outcome| outcome.range_bias.powi(2))
+        .sum();
     let rms = 100.0 * (squares / outcomes.len() as f64).sqrt();
     let worst = outcomes
         .iter()
@@ -117,7 +117,12 @@ fn simulated_figures(outcomes: &[Outcome]) -> Vec<Figure> {
             Bound::AtMost(0.3),
             count,
         ),
-        Figure::told("calibration.range_bias_10m_worst", some.map(|()| worst), "%", count),
+        Figure::told(
+            "calibration.range_bias_10m_worst",
+            some.map(|()| worst),
+            "%",
+            count,
+        ),
         Figure::told(
             "calibration.range_bias_within_2_sigma",
             some.map(|()| covered),
@@ -152,7 +157,12 @@ fn plot(outcomes: &[Outcome]) -> Sheet {
         outcomes
             .iter()
             .filter(|outcome| outcome.infrared == infrared)
-            .map(|outcome| (100.0 * outcome.range_sigma, 100.0 * outcome.range_bias.abs()))
+            .map(|outcome| {
+                (
+                    100.0 * outcome.range_sigma,
+                    100.0 * outcome.range_bias.abs(),
+                )
+            })
             .collect::<Vec<_>>()
     };
     let most = outcomes
@@ -166,7 +176,11 @@ fn plot(outcomes: &[Outcome]) -> Sheet {
         axis("found, absolute, %"),
     )
     .with(Series::new("both visible", Mark::Dots, points(false)))
-    .with(Series::new("near-infrared left eye", Mark::Dots, points(true)))
+    .with(Series::new(
+        "near-infrared left eye",
+        Mark::Dots,
+        points(true),
+    ))
     .with(Series::new(
         "two sigma",
         Mark::Dashed,

@@ -3,7 +3,7 @@
 use super::CalibrationEvalError;
 use super::boards::{NEAR_INFRARED, Rays, Sight, VISIBLE, render};
 use emberfix_calib::solve::{
-    Board, BoardKind, Calibration, Demands, View, calibrate as solve, find_corners, make_consistent,
+    Board, Calibration, Demands, View, calibrate as solve, find_corners, make_consistent,
 };
 use emberfix_calib::{Camera, Eye, Mounting, RawPixel, Rig, RigParts};
 use emberfix_frames::{Matrix3, Metres, MountAngles, UnitQuaternion, Vector3};
@@ -13,7 +13,6 @@ use std::path::Path;
 
 /// P2's and P4's board.
 const BOARD: Board = Board {
-    kind: BoardKind::Chessboard,
     columns: 9,
     rows: 6,
     square_m: 0.028,
@@ -48,7 +47,11 @@ impl Outcome {
     }
 
     pub(super) fn row(&self) -> Vec<String> {
-        let eyes = if self.infrared { "near-infrared" } else { "visible" };
+        let eyes = if self.infrared {
+            "near-infrared"
+        } else {
+            "visible"
+        };
         vec![
             format!("{} {eyes}", self.number),
             self.pairs.to_string(),
@@ -120,7 +123,11 @@ fn make_up(random: &mut impl Rng, infrared: bool) -> RigParts {
         left,
         right,
         right_from_left: turn.to_rotation_matrix().into_inner(),
-        translation_m: Vector3::new(-about(baseline_m, 0.003), about(0.0, 5e-4), about(0.0, 5e-4)),
+        translation_m: Vector3::new(
+            -about(baseline_m, 0.003),
+            about(0.0, 5e-4),
+            about(0.0, 5e-4),
+        ),
         max_skew_s: 0.001,
         disparity_bias_px: 0.1,
         mounting: Mounting {
@@ -190,17 +197,17 @@ fn pose(rig: &Rig, number: usize, random: &mut impl Rng) -> (Matrix3<f64>, Vecto
         let depth = camera.focal_px.0 * wide_m / (share * f64::from(width));
         let target = Vector3::new(
             (toward(place.0) * f64::from(width) - camera.principal_point_px.0) / camera.focal_px.0,
-            (toward(place.1) * f64::from(height) - camera.principal_point_px.1)
-                / camera.focal_px.1,
+            (toward(place.1) * f64::from(height) - camera.principal_point_px.1) / camera.focal_px.1,
             1.0,
         ) * depth;
         let axis_rad = random.random_range(0.0..std::f64::consts::TAU);
         let tilt_rad = random.random_range(5.0_f64..45.0).to_radians();
         let tilt = Vector3::new(axis_rad.cos(), axis_rad.sin(), 0.0) * tilt_rad;
         let spin = Vector3::new(0.0, 0.0, random.random_range(-0.3..0.3));
-        let turn = (UnitQuaternion::from_scaled_axis(tilt) * UnitQuaternion::from_scaled_axis(spin))
-            .to_rotation_matrix()
-            .into_inner();
+        let turn = (UnitQuaternion::from_scaled_axis(tilt)
+            * UnitQuaternion::from_scaled_axis(spin))
+        .to_rotation_matrix()
+        .into_inner();
         best = (turn, target - turn * middle);
         if seen_whole(rig, &best) {
             return best;
@@ -216,14 +223,19 @@ fn seen_whole(rig: &Rig, (turn, origin_m): &(Matrix3<f64>, Vector3<f64>)) -> boo
             && (4.0..f64::from(height) - 4.0).contains(&pixel.v)
     };
     let (columns, rows) = (BOARD.columns as f64, BOARD.rows as f64);
-    [(-1.2, -1.2), (columns + 0.2, -1.2), (-1.2, rows + 0.2), (columns + 0.2, rows + 0.2)]
-        .into_iter()
-        .all(|(a, b)| {
-            let point = turn * (Vector3::new(a, b, 0.0) * BOARD.square_m) + origin_m;
-            let other = rig.right_from_left() * point + rig.right_from_left_translation_m();
-            inside(rig.camera(Eye::Left).project(&point))
-                && inside(rig.camera(Eye::Right).project(&other))
-        })
+    [
+        (-1.2, -1.2),
+        (columns + 0.2, -1.2),
+        (-1.2, rows + 0.2),
+        (columns + 0.2, rows + 0.2),
+    ]
+    .into_iter()
+    .all(|(a, b)| {
+        let point = turn * (Vector3::new(a, b, 0.0) * BOARD.square_m) + origin_m;
+        let other = rig.right_from_left() * point + rig.right_from_left_translation_m();
+        inside(rig.camera(Eye::Left).project(&point))
+            && inside(rig.camera(Eye::Right).project(&other))
+    })
 }
 
 fn compare(
@@ -248,7 +260,10 @@ fn compare(
         ..truth.clone()
     };
     let found = found.check(Path::new("calibrated rig"))?;
-    let at_10m = calibration.range_errors.iter().find(|error| error.depth_m == 10.0);
+    let at_10m = calibration
+        .range_errors
+        .iter()
+        .find(|error| error.depth_m == 10.0);
     Ok(Outcome {
         number,
         infrared,
