@@ -1,5 +1,7 @@
 //! A real rig's pictures (`../shared/data/stereo/chess_a`): 29 pairs, 640x360, 9x6 corners, 24.23 mm.
 
+#![expect(clippy::unwrap_used, reason = "a test may stop at its first surprise")]
+
 use emberfix_calib::solve::{
     Board, StereoSolution, View, cross_validate, find_corners, make_consistent, range_errors,
     read_grey, solve,

@@ -1,5 +1,7 @@
 //! Files of other programs: round trips lose nothing, broken ones are refused in one line.
 
+#![expect(clippy::unwrap_used, reason = "a test may stop at its first surprise")]
+
 use emberfix_calib::exchange::{
     Answers, Imported, ImuAxes, LengthUnit, export_opencv, export_ros, import,
 };

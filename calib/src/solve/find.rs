@@ -54,7 +54,7 @@ fn raw(point: Point2f) -> RawPixel {
 /// The least way from one corner to the next in its row or column.
 fn spacing_px(points: &Vector<Point2f>, columns: usize) -> f64 {
     let points: Vec<Point2f> = points.iter().collect();
-    let way = |a: Point2f, b: Point2f| f64::from((a - b).norm());
+    let way = |a: Point2f, b: Point2f| (a - b).norm();
     let in_rows = points
         .chunks(columns)
         .flat_map(|row| row.windows(2).map(|pair| way(pair[0], pair[1])));
