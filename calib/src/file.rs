@@ -336,8 +336,14 @@ fn build(raw: RawRig, path: &Path) -> Result<Rig, RigError> {
             source,
         })?;
     let findings = implausible(&left, &right, &rectification, &translation_m);
-    if findings.iter().any(|found| found.severity == Severity::Refusal) {
-        return Err(values(path, findings.iter().map(Finding::to_string).collect()));
+    if findings
+        .iter()
+        .any(|found| found.severity == Severity::Refusal)
+    {
+        return Err(values(
+            path,
+            findings.iter().map(Finding::to_string).collect(),
+        ));
     }
     Ok(Rig {
         name: raw.name,
