@@ -15,6 +15,7 @@ pub mod assess;
 pub mod cli;
 pub mod deliver;
 pub mod detect;
+pub mod doctor;
 pub mod eval;
 pub mod ground;
 pub mod ingest;
