@@ -4,15 +4,17 @@
 //! mission file. The `[sim]` table belongs to the simulator and is not read here.
 
 use crate::detect::{DetectorConfig, Family};
-use crate::locate::{ConstantPlane, SharedSigmas, Terrain};
+use crate::locate::{SharedSigmas, Terrain};
 use crate::pose::PoseConfig;
-use crate::range::SgbmConfig;
+use crate::range::{HsvMask, Method, RangeConfig};
 use crate::track::TrackConfig;
 use emberfix_calib::{Checks, KeyProblem, Rig, RigError, toml_problem, unknown_keys};
 use emberfix_frames::{EllipsoidHeight, Wgs84, place_from_degrees};
 use serde::Deserialize;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+
+mod terrain;
 
 /// Why a mission file was refused.
 #[derive(Debug, thiserror::Error)]
@@ -71,8 +73,10 @@ pub struct Mission {
     pub camera_url: String,
     /// The detector.
     pub detector: DetectorConfig,
-    /// Stereo matching.
-    pub range: SgbmConfig,
+    /// How ranges are measured.
+    pub range_method: Method,
+    /// Numbers of ranging.
+    pub range: RangeConfig,
     /// The ground, if the mission knows it.
     pub terrain: Option<Arc<dyn Terrain>>,
     /// Defaults and limits of the pose.
@@ -109,7 +113,7 @@ struct RawMission {
     model: RawModel,
     #[serde(default)]
     range: RawRange,
-    terrain: Option<RawTerrain>,
+    terrain: Option<terrain::RawTerrain>,
     #[serde(default)]
     sigma: RawSigma,
     #[serde(default)]
@@ -153,15 +157,10 @@ struct RawModel {
 
 #[derive(Deserialize, Default)]
 struct RawRange {
+    method: Option<String>,
+    mask: Option<String>,
     max_disparity_px: Option<u32>,
     max_sigma_over_range: Option<f64>,
-}
-
-#[derive(Deserialize)]
-struct RawTerrain {
-    kind: String,
-    height_ellipsoid_m: f64,
-    sigma_m: f64,
 }
 
 #[derive(Deserialize)]
@@ -251,11 +250,18 @@ const KNOWN: &[&str] = &[
     "model.tile_px",
     "model.overlap_px",
     "model.threads",
+    "range.mask",
     "range.max_disparity_px",
     "range.max_sigma_over_range",
+    "range.method",
     "terrain.kind",
     "terrain.height_ellipsoid_m",
     "terrain.sigma_m",
+    "terrain.paths",
+    "terrain.vertical_datum",
+    "terrain.horizontal_sigma_m",
+    "terrain.canopy_m",
+    "terrain.reach_m",
     "sigma.gnss_horizontal_m",
     "sigma.gnss_vertical_m",
     "sigma.gnss_floor_m",
@@ -354,26 +360,7 @@ fn check(raw: &RawMission) -> Vec<String> {
     );
     check_numbers(&mut checks, raw);
     if let Some(terrain) = &raw.terrain {
-        if terrain.kind != "plane" {
-            checks.problem(format!(
-                "terrain.kind is {:?}, allowed is \"plane\"",
-                terrain.kind
-            ));
-        }
-        checks.range(
-            "terrain.height_ellipsoid_m",
-            terrain.height_ellipsoid_m,
-            -500.0,
-            9000.0,
-            "",
-        );
-        checks.range(
-            "terrain.sigma_m",
-            terrain.sigma_m,
-            0.05,
-            500.0,
-            " (never perfectly flat)",
-        );
+        terrain.check(&mut checks);
     }
     check_sigma(&mut checks, &raw.sigma);
     checks.range(
@@ -412,6 +399,7 @@ fn check_numbers(checks: &mut Checks, raw: &RawMission) {
         let problem = problem.replace("num_disparities", "max_disparity_px");
         checks.problem(format!("range.{problem}"));
     }
+    check_range_names(checks, &raw.range);
 }
 
 fn check_sigma(checks: &mut Checks, sigma: &RawSigma) {
@@ -469,13 +457,15 @@ fn build(raw: RawMission, path: &Path) -> Result<Mission, MissionError> {
         path: path.to_owned(),
         problems: vec![format!("datum: {error}")],
     })?;
-    let terrain = raw.terrain.as_ref().map(|plane| -> Arc<dyn Terrain> {
-        let height = EllipsoidHeight::from_m(plane.height_ellipsoid_m);
-        Arc::new(ConstantPlane {
-            height,
-            sigma_m: plane.sigma_m,
-        })
-    });
+    let terrain = raw
+        .terrain
+        .as_ref()
+        .map(|terrain| terrain.build(&datum, &beside))
+        .transpose()
+        .map_err(|problems| MissionError::Values {
+            path: path.to_owned(),
+            problems,
+        })?;
     let state_dir = raw
         .state
         .dir
@@ -483,6 +473,7 @@ fn build(raw: RawMission, path: &Path) -> Result<Mission, MissionError> {
         .map_or_else(|| Path::new(".emberfix").join(&raw.name), beside);
     Ok(Mission {
         detector: detector(&raw.model, &beside),
+        range_method: method(&raw.range).unwrap_or_default(),
         range: range(&raw.range),
         pose: PoseConfig {
             gnss_horizontal_m: raw.sigma.gnss_horizontal_m,
@@ -537,9 +528,40 @@ fn detector(raw: &RawModel, beside: &dyn Fn(&Path) -> PathBuf) -> DetectorConfig
     }
 }
 
-fn range(raw: &RawRange) -> SgbmConfig {
-    let usual = SgbmConfig::default();
-    SgbmConfig {
+/// Methods and masks are named, not numbered.
+fn check_range_names(checks: &mut Checks, raw: &RawRange) {
+    let methods = Method::ALL.map(Method::name).join(", ");
+    for (key, named, known, allowed) in [
+        (
+            "method",
+            &raw.method,
+            method(raw).is_some(),
+            methods.as_str(),
+        ),
+        ("mask", &raw.mask, mask(raw).is_some(), "flame, printed"),
+    ] {
+        if let (Some(name), false) = (named, known) {
+            checks.problem(format!("range.{key} is {name:?}, allowed are {allowed}"));
+        }
+    }
+}
+
+fn method(raw: &RawRange) -> Option<Method> {
+    raw.method.as_deref().and_then(Method::from_name)
+}
+
+fn mask(raw: &RawRange) -> Option<HsvMask> {
+    match raw.mask.as_deref()? {
+        "flame" => Some(HsvMask::flame()),
+        "printed" => Some(HsvMask::printed()),
+        _ => None,
+    }
+}
+
+fn range(raw: &RawRange) -> RangeConfig {
+    let usual = RangeConfig::default();
+    RangeConfig {
+        mask: mask(raw).unwrap_or(usual.mask),
         num_disparities: raw.max_disparity_px.unwrap_or(usual.num_disparities),
         max_sigma_over_range: raw
             .max_sigma_over_range

@@ -10,6 +10,7 @@
 mod file;
 mod nearest;
 mod rectify;
+pub mod solve;
 #[cfg(test)]
 mod tests;
 

@@ -4,7 +4,7 @@ use super::{Failure, detector};
 use crate::alarm::FireId;
 use crate::mission::Mission;
 use crate::pipeline::Pipeline;
-use crate::range::SgbmRanger;
+use crate::range;
 use crate::replay::{Replay, ReplayError, telemetry_log};
 use indicatif::{ProgressBar, ProgressStyle};
 use std::path::{Path, PathBuf};
@@ -59,8 +59,9 @@ fn images_and_telemetry(
     arguments: &ReplayArguments,
 ) -> Result<Result<serde_json::Value, ReplayError>, Failure> {
     let detector = detector(mission, arguments.boxes.as_deref())?;
-    let ranger = SgbmRanger::new(&mission.rig, mission.range.clone()).map_err(Failure::refused)?;
-    let pipeline = Pipeline::new(mission, detector, Box::new(ranger), FireId(1));
+    let ranger = range::open(mission.range_method, &mission.rig, &mission.range)
+        .map_err(Failure::refused)?;
+    let pipeline = Pipeline::new(mission, detector, ranger, FireId(1));
     let replay = Replay::open(&arguments.recording, mission, pipeline);
     let bar = ProgressBar::new_spinner();
     if let Ok(style) = ProgressStyle::with_template("{spinner} replay: {msg}, {elapsed}") {

@@ -3,7 +3,7 @@
 use super::{Failure, detector, runtime};
 use crate::mission::Mission;
 use crate::pipeline::Pipeline;
-use crate::range::SgbmRanger;
+use crate::range;
 use crate::service::{self, ServiceError};
 use std::path::PathBuf;
 
@@ -48,7 +48,8 @@ pub fn run(arguments: RunArguments) -> Result<(), Failure> {
         mission.state_dir = folder;
     }
     let detector = detector(&mission, arguments.boxes.as_deref())?;
-    let ranger = SgbmRanger::new(&mission.rig, mission.range.clone()).map_err(Failure::refused)?;
+    let ranger = range::open(mission.range_method, &mission.rig, &mission.range)
+        .map_err(Failure::refused)?;
     let fail = |error: ServiceError| {
         if error.is_refusal() {
             Failure::refused(error)
@@ -60,7 +61,7 @@ pub fn run(arguments: RunArguments) -> Result<(), Failure> {
     let first = outbox
         .next_fire_number()
         .map_err(|error| fail(error.into()))?;
-    let pipeline = Pipeline::new(&mission, detector, Box::new(ranger), first);
+    let pipeline = Pipeline::new(&mission, detector, ranger, first);
     runtime()?
         .block_on(service::run(
             mission,

@@ -12,7 +12,10 @@ mod geometry;
 mod terrain;
 
 pub use geometry::{SHARED, Shared, SharedSigmas, View};
-pub use terrain::{ConstantPlane, Terrain, TerrainHit, meet_terrain};
+pub use terrain::{
+    Area, ConstantPlane, Coverage, Ground, Terrain, TerrainHit, Tile, TileError, TileParts,
+    TileSigmas, Tiles, VerticalDatum, meet_terrain,
+};
 
 use crate::alarm::Method;
 use emberfix_calib::RectifiedPixel;
@@ -29,7 +32,7 @@ pub struct Sighting {
     pub base_sigma_px: (f64, f64),
     /// Width and height of the box, pixels.
     pub size_px: (f64, f64),
-    /// Disparity of the flame, if stereo gave one.
+    /// Disparity of the flame, if stereo gave one; with `at_least_m` beside it too weak to be a range.
     pub disparity: Option<DisparityOf>,
     /// Light of the box above a plain scene: sum over its pixels of what they exceed
     /// [`crate::assess::PLAIN_LEVEL`] by, grey levels times pixels.
@@ -75,12 +78,14 @@ const MAX_RELATIVE_SIGMA: f64 = 0.5;
 #[must_use]
 pub fn fix(sighting: &Sighting, view: &View<'_>, terrain: Option<&dyn Terrain>) -> Option<Fix> {
     let ray = view.ray_enu(sighting.base);
+    // A disparity too weak to be a range of its own counts in the estimator, where it stays linear.
     let stereo = sighting
         .disparity
+        .filter(|_| sighting.at_least_m.is_none())
         .and_then(|d| stereo_range(sighting, &d, view));
     let on_ground = terrain.and_then(|t| match meet_terrain(&view.camera_enu, &ray, t, view) {
         TerrainHit::Met { range_m, sigma_m } => Some((range_m, sigma_m)),
-        TerrainHit::Above | TerrainHit::Grazing | TerrainHit::Unknown => None,
+        _ => None,
     });
     let on_ground = on_ground.filter(|(range, _)| {
         sighting

@@ -355,7 +355,7 @@ impl Pipeline {
         let (found, classified) = &seen.sightings[outcome.index];
         let at = classified.sighting.at;
         let situation = outcome.fix.as_ref().map(|fix| {
-            let mut situation = situate(&fix.place, &mut self.poses, self.terrain.as_deref());
+            let mut situation = situate(&fix.place, &self.poses, self.terrain.as_deref());
             situation.degraded = self
                 .degraded
                 .iter()
@@ -373,7 +373,7 @@ impl Pipeline {
 
     fn alarms(&mut self) -> Vec<Output> {
         let (datum, terrain) = (self.datum, self.terrain.clone());
-        let (poses, degraded) = (&mut self.poses, &self.degraded);
+        let (poses, degraded) = (&self.poses, &self.degraded);
         let due = self.desk.due(self.tracker.fires(), |fire| {
             let place = place_from_ecef(&ecef_from_enu(&datum).transform(fire.position()))?;
             let mut situation = situate(&place, poses, terrain.as_deref());
@@ -398,7 +398,7 @@ impl AutopilotLock {
 }
 
 /// Altitude and height above ground of a place.
-fn situate(place: &Wgs84, poses: &mut PoseEstimator, terrain: Option<&dyn Terrain>) -> Situation {
+fn situate(place: &Wgs84, poses: &PoseEstimator, terrain: Option<&dyn Terrain>) -> Situation {
     let ground = terrain.and_then(|terrain| terrain.height_at(place));
     Situation {
         place: *place,

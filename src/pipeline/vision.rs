@@ -6,7 +6,7 @@ use crate::assess::PLAIN_LEVEL;
 use crate::detect::{BoxPx, Detection, DetectionClass, Detector, LeftImage};
 use crate::ingest::{EncodedImage, EyeHealth, EyeWatch, ImageDecoder, StereoPair};
 use crate::locate::{DisparityOf, Sighting};
-use crate::range::{Ranger, Ranging, RawPair, Target};
+use crate::range::{Disparity, Ranger, Ranging, RawPair, Target};
 use crate::track::Classified;
 use emberfix_calib::{Eye, RawPixel, RectifiedPixel, Rig};
 use emberfix_frames::Stamped;
@@ -136,15 +136,17 @@ impl Vision {
             box_px: detection.box_px,
         };
         let ranging = match self.ranger.range(pair, &target) {
-            Ok(ranging) => ranging,
+            Ok(ranging) => Some(ranging),
             Err(error) => {
                 counters.add("range", "failed");
                 tracing::warn!(%error, "no stereo for this box");
-                Ranging::NoMatch
+                None
             }
         };
-        counters.add("range", name_of(&ranging));
-        let sighting = self.place_in_rectified(pair, &detection.box_px, &ranging)?;
+        if let Some(ranging) = &ranging {
+            counters.add("range", name_of(ranging));
+        }
+        let sighting = self.place_in_rectified(pair, &detection.box_px, ranging.as_ref())?;
         Some(Classified {
             sighting,
             class,
@@ -156,7 +158,7 @@ impl Vision {
         &self,
         pair: &RawPair,
         box_px: &BoxPx,
-        ranging: &Ranging,
+        ranging: Option<&Ranging>,
     ) -> Option<Sighting> {
         let (u, v) = box_px.base();
         let rectification = self.rig.rectification();
@@ -170,23 +172,7 @@ impl Vision {
             rectification.focal_px() / camera.focal_px.1,
         );
         let size_px = (box_px.width * scale.0, box_px.height * scale.1);
-        let (disparity, at_least_m) = match *ranging {
-            Ranging::Measured {
-                disparity_px,
-                sigma_px,
-                centroid,
-                ..
-            } => (
-                Some(DisparityOf {
-                    px: disparity_px,
-                    sigma_px,
-                    centroid,
-                }),
-                None,
-            ),
-            Ranging::BeyondReach { at_least_m } => (None, Some(at_least_m)),
-            Ranging::NoMatch => (None, None),
-        };
+        let (disparity, at_least_m) = ranging.map_or((None, None), evidence);
         Some(Sighting {
             at: pair.at,
             base,
@@ -199,6 +185,34 @@ impl Vision {
             glow: glow(&pair.left_bgr, box_px),
             at_least_m,
         })
+    }
+}
+
+/// What the estimator gets of a ranging: the disparity, a weak one too, and the depth that it excludes.
+fn evidence(ranging: &Ranging) -> (Option<DisparityOf>, Option<f64>) {
+    let of = |disparity: Disparity| DisparityOf {
+        px: disparity.px,
+        sigma_px: disparity.sigma_px,
+        centroid: disparity.centroid,
+    };
+    match *ranging {
+        Ranging::Measured {
+            disparity_px,
+            sigma_px,
+            centroid,
+            ..
+        } => {
+            let measured = DisparityOf {
+                px: disparity_px,
+                sigma_px,
+                centroid,
+            };
+            (Some(measured), None)
+        }
+        Ranging::BeyondReach {
+            at_least_m, weak, ..
+        } => (Some(of(weak)), Some(at_least_m)),
+        Ranging::NoMatch { .. } => (None, None),
     }
 }
 
@@ -225,7 +239,7 @@ fn name_of(ranging: &Ranging) -> &'static str {
     match ranging {
         Ranging::Measured { .. } => "measured",
         Ranging::BeyondReach { .. } => "beyond_reach",
-        Ranging::NoMatch => "no_match",
+        Ranging::NoMatch { why } => why.name(),
     }
 }
 

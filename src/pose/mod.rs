@@ -269,7 +269,7 @@ impl PoseEstimator {
     }
 
     /// Geoid undulation at a place: the receiver's own if it gives one, EGM96 otherwise.
-    pub fn undulation(&mut self, place: &Wgs84) -> GeoidUndulation {
+    pub fn undulation(&self, place: &Wgs84) -> GeoidUndulation {
         match self.separation {
             Some(separation) => GeoidUndulation::from_m(separation),
             None => self
@@ -280,7 +280,7 @@ impl PoseEstimator {
 
     /// The pose at a moment of the autopilot's clock, given as service time. `now` is the latest
     /// arrival; it decides whether to wait for a sample on the far side.
-    pub fn at(&mut self, moment: ServiceTime, now: ServiceTime) -> PoseAnswer {
+    pub fn at(&self, moment: ServiceTime, now: ServiceTime) -> PoseAnswer {
         let Some(boot) = self.sync.to_boot(moment) else {
             return PoseAnswer::NeverSeen {
                 what: "autopilot clock",
@@ -327,7 +327,7 @@ impl PoseEstimator {
     }
 
     fn assemble(
-        &mut self,
+        &self,
         moment: ServiceTime,
         attitude: &Bracket<AttitudeSample>,
         position: &Bracket<PositionSample>,
@@ -382,7 +382,7 @@ impl PoseEstimator {
     }
 
     /// Cubic Hermite between two samples (their velocities count), straight on after the last.
-    fn place(&mut self, position: &Bracket<PositionSample>) -> Option<Wgs84> {
+    fn place(&self, position: &Bracket<PositionSample>) -> Option<Wgs84> {
         let first = self.sample_place(&position.earlier.1)?;
         let v0 = position.earlier.1.velocity_enu_m_s;
         let offset = match &position.later {
@@ -398,7 +398,7 @@ impl PoseEstimator {
         emberfix_frames::place_from_ecef(&ecef_from_enu(&first).transform(point))
     }
 
-    fn sample_place(&mut self, sample: &PositionSample) -> Option<Wgs84> {
+    fn sample_place(&self, sample: &PositionSample) -> Option<Wgs84> {
         let flat = place_from_degrees(
             sample.latitude_deg,
             sample.longitude_deg,
@@ -419,6 +419,28 @@ impl PoseEstimator {
             self.attitudes.clear();
             self.positions.clear();
         }
+    }
+}
+
+/// Poses at any moment, for whoever learns that the camera's clock is off.
+pub trait PoseAt {
+    /// The pose at a moment of the service clock from what is known by now; `None` where there is
+    /// no honest one.
+    fn pose_at(&self, moment: ServiceTime) -> Option<Pose>;
+}
+
+impl PoseAt for PoseEstimator {
+    fn pose_at(&self, moment: ServiceTime) -> Option<Pose> {
+        match self.at(moment, moment + WAIT) {
+            PoseAnswer::Fresh(pose) => Some(*pose),
+            _ => None,
+        }
+    }
+}
+
+impl<F: Fn(ServiceTime) -> Option<Pose>> PoseAt for F {
+    fn pose_at(&self, moment: ServiceTime) -> Option<Pose> {
+        self(moment)
     }
 }
 

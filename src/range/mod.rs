@@ -15,6 +15,7 @@
 //! the disparity came out a quarter too small), so smoke is always [`Ranging::NoMatch`]. The sigma
 //! is that of matching alone: calibration's share stands in the rig.
 
+mod config;
 mod correlate;
 mod mask;
 mod patch;
@@ -23,11 +24,11 @@ mod sgbm;
 #[cfg(test)]
 mod tests;
 
+pub use config::{Method, Methods, RangeConfig};
 pub use mask::HsvMask;
-pub use sgbm::{MatchMethod, SgbmConfig, SgbmRanger};
 
 use crate::detect::{BoxPx, DetectionClass};
-use emberfix_calib::RectifiedPixel;
+use emberfix_calib::{RectifiedPixel, Rig};
 use emberfix_frames::ServiceTime;
 use opencv::core::Mat;
 
@@ -51,12 +52,25 @@ pub struct Target {
     pub box_px: BoxPx,
 }
 
+/// A disparity and what it rests on.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Disparity {
+    /// `u_left - u_right`, rectified pixels.
+    pub px: f64,
+    /// One sigma of it (matching only; calibration comes on top), pixels.
+    pub sigma_px: f64,
+    /// Pixels that it rests on.
+    pub support: u32,
+    /// Centroid of those pixels in the rectified left image.
+    pub centroid: RectifiedPixel,
+}
+
 /// What stereo says of one target.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Ranging {
     /// A disparity with its error.
     Measured {
-        /// Mean of the valid disparities of the flame, `u_left - u_right`, rectified pixels.
+        /// Disparity of the flame, `u_left - u_right`, rectified pixels.
         disparity_px: f64,
         /// One sigma of it (matching only; calibration comes on top), pixels.
         sigma_px: f64,
@@ -64,23 +78,99 @@ pub enum Ranging {
         support: u32,
         /// Centroid of those pixels in the rectified left image.
         centroid: RectifiedPixel,
+        /// The methods that it was made of.
+        used: Methods,
     },
-    /// Too far to say more than this.
+    /// Too far to say more than this by stereo alone; an estimator still gains from the disparity.
     BeyondReach {
         /// Least depth along the boresight that agrees with what was seen, metres.
         at_least_m: f64,
+        /// The weak disparity itself; it may lie below that of infinity, within its sigma.
+        weak: Disparity,
+        /// The methods that it was made of.
+        used: Methods,
     },
-    /// The right eye shows nothing that matches, or there is no right eye.
-    NoMatch,
+    /// Nothing that could be believed.
+    NoMatch {
+        /// Why not.
+        why: Refusal,
+    },
+}
+
+/// Why a target has no disparity. An expected outcome, not an error.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Refusal {
+    /// The right eye is missing: dead, dark or out of step.
+    NoSecondEye,
+    /// It is smoke: what matches there is the ground that shows through it.
+    Smoke,
+    /// Nothing of the box is in the rectified image.
+    OutsideImage,
+    /// Too few pixels to match.
+    TooSmall,
+    /// The right eye has no contrast where the target should be.
+    Flat,
+    /// Nothing in the right eye resembles the target.
+    NoPeak,
+    /// Two places in the right eye resemble the target alike.
+    Ambiguous,
+    /// What matches in the right eye matches another thing in the left one better.
+    OneSided,
+    /// The best match lies at the end of the disparities that are tried, nearer than any of them.
+    TooNear,
+    /// The best match would lie beyond infinity: swapped eyes or a wrong match.
+    BeyondInfinity,
+    /// The parts of the target do not agree on one disparity.
+    Inconsistent,
+    /// The methods contradict each other.
+    Disagreement,
+}
+
+impl Refusal {
+    /// One word for counters.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::NoSecondEye => "no_second_eye",
+            Self::Smoke => "smoke",
+            Self::OutsideImage => "outside_image",
+            Self::TooSmall => "too_small",
+            Self::Flat => "flat",
+            Self::NoPeak => "no_peak",
+            Self::Ambiguous => "ambiguous",
+            Self::OneSided => "one_sided",
+            Self::TooNear => "too_near",
+            Self::BeyondInfinity => "beyond_infinity",
+            Self::Inconsistent => "inconsistent",
+            Self::Disagreement => "disagreement",
+        }
+    }
 }
 
 /// Ranges one target in one pair.
 pub trait Ranger: Send {
-    /// Starts on a new pair (work that all of its targets share).
+    /// The target's disparity, or why there is none. Touches no pixel that its box and the epipolar
+    /// strip beside it do not cover.
     ///
     /// # Errors
     /// [`RangeError`] when the pair can't be used at all.
     fn range(&mut self, pair: &RawPair, target: &Target) -> Result<Ranging, RangeError>;
+}
+
+/// The ranger of a method for one rig.
+///
+/// # Errors
+/// [`RangeError::OpenCv`] when OpenCV refuses the configuration or the rig.
+pub fn open(
+    method: Method,
+    rig: &Rig,
+    config: &RangeConfig,
+) -> Result<Box<dyn Ranger>, RangeError> {
+    Ok(Box::new(sgbm::SgbmRanger::new(
+        method,
+        rig,
+        config.clone(),
+    )?))
 }
 
 /// Why a pair can't be ranged.

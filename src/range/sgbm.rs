@@ -3,141 +3,19 @@
 use super::correlate::{Gray, peak_near, refine};
 use super::patch::{Cutter, Margins, Patch};
 use super::pool::{Pooled, Sample, pool};
-use super::{HsvMask, RangeError, Ranger, Ranging, RawPair, Target};
+use super::{
+    Disparity, Method, Methods, RangeConfig, RangeError, Ranger, Ranging, RawPair, Refusal, Target,
+};
 use crate::detect::DetectionClass;
 use emberfix_calib::{RectifiedPixel, Rig};
 use opencv::calib3d::{StereoSGBM, StereoSGBM_MODE_SGBM};
 use opencv::core::{Mat, MatTraitConst, Point, Ptr, Rect, Vec3b};
 use opencv::prelude::{MatTraitConstManual, StereoMatcherTrait};
-use serde::{Deserialize, Serialize};
-
-/// How the disparity is found.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum MatchMethod {
-    /// Semi-global matching per pixel, pooled (P3, P4). Pulled towards whole pixels by up to
-    /// 0.14 px.
-    Sgbm,
-    /// Semi-global matching to the pixel, then least squares over the whole target.
-    #[default]
-    Correlate,
-}
-
-/// How to match. [`SgbmConfig::problems`] checks the numbers.
-#[derive(Debug, Clone, PartialEq)]
-pub struct SgbmConfig {
-    /// How the disparity is found.
-    pub method: MatchMethod,
-    /// Which pixels of the box count.
-    pub mask: HsvMask,
-    /// Disparities that are tried, a multiple of 16.
-    pub num_disparities: u32,
-    /// Side of the matched block, odd.
-    pub block_px: u32,
-    /// Percent by which the best match must beat the second.
-    pub uniqueness_percent: u32,
-    /// Largest patch of lone disparities that is dropped, pixels.
-    pub speckle_window_px: u32,
-    /// Greatest difference of left-to-right and right-to-left disparities, pixels.
-    pub left_right_max_px: u32,
-    /// Sobel values are clipped to this (P4: 15).
-    pub pre_filter_cap: u32,
-    /// Context around the box, pixels.
-    pub context_px: u32,
-    /// Fewest pixels that a disparity may rest on.
-    pub min_support: u32,
-    /// Least share of the valid pixels that must agree.
-    pub min_agreement: f64,
-    /// Least normalised correlation of the target at its disparity.
-    pub min_correlation: f64,
-    /// No disparity is better than this, one sigma.
-    pub sigma_floor_px: f64,
-    /// Range sigma over range from which a disparity only says "at least this far".
-    pub max_sigma_over_range: f64,
-}
-
-impl Default for SgbmConfig {
-    fn default() -> Self {
-        Self {
-            method: MatchMethod::default(),
-            mask: HsvMask::default(),
-            num_disparities: 96,
-            block_px: 5,
-            uniqueness_percent: 5,
-            speckle_window_px: 50,
-            left_right_max_px: 1,
-            pre_filter_cap: 31,
-            context_px: 16,
-            min_support: 12,
-            min_agreement: 0.4,
-            min_correlation: 0.6,
-            sigma_floor_px: 0.1,
-            max_sigma_over_range: 0.35,
-        }
-    }
-}
-
-impl SgbmConfig {
-    /// Every number that is out of range: key, value, allowed range. Empty when all is well.
-    #[must_use]
-    pub fn problems(&self) -> Vec<String> {
-        let mut problems = Vec::new();
-        let mut within = |key: &str, value: f64, low: f64, high: f64| {
-            if !(low..=high).contains(&value) {
-                problems.push(format!("{key} is {value}, allowed is {low} to {high}"));
-            }
-        };
-        within(
-            "num_disparities",
-            f64::from(self.num_disparities),
-            16.0,
-            512.0,
-        );
-        within("block_px", f64::from(self.block_px), 3.0, 21.0);
-        within(
-            "uniqueness_percent",
-            f64::from(self.uniqueness_percent),
-            0.0,
-            50.0,
-        );
-        within(
-            "speckle_window_px",
-            f64::from(self.speckle_window_px),
-            0.0,
-            1000.0,
-        );
-        within(
-            "left_right_max_px",
-            f64::from(self.left_right_max_px),
-            0.0,
-            16.0,
-        );
-        within("pre_filter_cap", f64::from(self.pre_filter_cap), 1.0, 63.0);
-        within("context_px", f64::from(self.context_px), 4.0, 128.0);
-        within("min_support", f64::from(self.min_support), 4.0, 10_000.0);
-        within("min_agreement", self.min_agreement, 0.1, 1.0);
-        within("min_correlation", self.min_correlation, 0.0, 0.99);
-        within("sigma_floor_px", self.sigma_floor_px, 0.01, 2.0);
-        within("max_sigma_over_range", self.max_sigma_over_range, 0.01, 1.0);
-        if !self.num_disparities.is_multiple_of(16) {
-            problems.push(format!(
-                "num_disparities is {}, allowed are multiples of 16",
-                self.num_disparities
-            ));
-        }
-        if self.block_px.is_multiple_of(2) {
-            problems.push(format!(
-                "block_px is {}, allowed are odd numbers",
-                self.block_px
-            ));
-        }
-        problems
-    }
-}
 
 /// Ranges flames by stereo matching inside their boxes.
-pub struct SgbmRanger {
-    config: SgbmConfig,
+pub(super) struct SgbmRanger {
+    method: Method,
+    config: RangeConfig,
     cutter: Cutter,
     matcher: Ptr<StereoSGBM>,
     search: Search,
@@ -173,7 +51,7 @@ impl SgbmRanger {
     ///
     /// # Errors
     /// [`RangeError::OpenCv`] when OpenCV refuses the configuration or the rig's maps.
-    pub fn new(rig: &Rig, config: SgbmConfig) -> Result<Self, RangeError> {
+    pub fn new(method: Method, rig: &Rig, config: RangeConfig) -> Result<Self, RangeError> {
         let rectification = rig.rectification();
         let infinity_px = rectification.infinity_disparity_px();
         let least = infinity_px.floor() as i32 - BELOW_INFINITY_PX;
@@ -192,6 +70,7 @@ impl SgbmRanger {
                 max_sigma_over_range: config.max_sigma_over_range,
             },
             config,
+            method,
         })
     }
 
@@ -249,9 +128,9 @@ impl SgbmRanger {
             return Ok(None);
         };
         let found =
-            match config.method {
-                MatchMethod::Sgbm => Some(Found::pooled(&pooled, config.block_px)),
-                MatchMethod::Correlate => refine(&left, &right, &pixels, peak.disparity_px).map(
+            match self.method {
+                Method::Sgbm => Some(Found::pooled(&pooled, config.block_px)),
+                _ => refine(&left, &right, &pixels, peak.disparity_px).map(
                     |(disparity_px, sigma_px)| Found {
                         disparity_px,
                         sigma_px,
@@ -292,50 +171,71 @@ impl Ranger for SgbmRanger {
         let (DetectionClass::Fire | DetectionClass::NonFire, Some(right)) =
             (target.class, &pair.right_gray)
         else {
-            return Ok(Ranging::NoMatch);
+            return Ok(Ranging::NoMatch {
+                why: Refusal::NoPeak,
+            });
         };
         let margins = self.margins();
         let Some(patch) = self
             .cutter
             .cut(&pair.left_bgr, right, &target.box_px, margins)?
         else {
-            return Ok(Ranging::NoMatch);
+            return Ok(Ranging::NoMatch {
+                why: Refusal::NoPeak,
+            });
         };
         let mask = target_mask(&patch, &self.config)?;
         let samples = self.samples(&patch, &mask)?;
         let found = self.measure(&patch, &samples)?;
-        Ok(found.map_or(Ranging::NoMatch, |found| {
-            self.reach.judge(&found, patch.origin)
-        }))
+        Ok(found.map_or(
+            Ranging::NoMatch {
+                why: Refusal::NoPeak,
+            },
+            |found| self.reach.judge(&found, patch.origin, self.method),
+        ))
     }
 }
 
 impl Reach {
-    fn judge(&self, found: &Found, origin: (i32, i32)) -> Ranging {
+    fn judge(&self, found: &Found, origin: (i32, i32), method: Method) -> Ranging {
         let from_infinity = found.disparity_px - self.infinity_px;
         let sigma = found.sigma_px.hypot(self.bias_px);
         if from_infinity < -2.0 * sigma {
             // Beyond infinity: swapped eyes or a wrong match, not a far fire.
-            return Ranging::NoMatch;
-        }
-        if from_infinity < 2.0 * sigma || sigma > self.max_sigma_over_range * from_infinity {
-            let at_least_m = self.focal_baseline / (from_infinity.max(0.0) + 2.0 * sigma);
-            return Ranging::BeyondReach { at_least_m };
+            return Ranging::NoMatch {
+                why: Refusal::BeyondInfinity,
+            };
         }
         let (column, row) = found.pooled.centroid;
-        Ranging::Measured {
-            disparity_px: found.disparity_px,
+        let found = Disparity {
+            px: found.disparity_px,
             sigma_px: found.sigma_px,
             support: found.pooled.support,
             centroid: RectifiedPixel {
                 u: column + f64::from(origin.0),
                 v: row + f64::from(origin.1),
             },
+        };
+        let used = Methods::only(method);
+        if from_infinity < 2.0 * sigma || sigma > self.max_sigma_over_range * from_infinity {
+            let at_least_m = self.focal_baseline / (from_infinity.max(0.0) + 2.0 * sigma);
+            return Ranging::BeyondReach {
+                at_least_m,
+                weak: found,
+                used,
+            };
+        }
+        Ranging::Measured {
+            disparity_px: found.px,
+            sigma_px: found.sigma_px,
+            support: found.support,
+            centroid: found.centroid,
+            used,
         }
     }
 }
 
-fn matcher(config: &SgbmConfig, least: i32) -> opencv::Result<Ptr<StereoSGBM>> {
+fn matcher(config: &RangeConfig, least: i32) -> opencv::Result<Ptr<StereoSGBM>> {
     let block = config.block_px as i32;
     StereoSGBM::create(
         least,
@@ -356,7 +256,7 @@ fn matcher(config: &SgbmConfig, least: i32) -> opencv::Result<Ptr<StereoSGBM>> {
 /// The flame's pixels in the target: those that the gate keeps and that outshine the surroundings.
 /// Where that leaves too few (dry grass is as yellow as flame), what the gate keeps; where that is
 /// too little as well (a thing in colours that the gate does not know), all of them.
-fn target_mask(patch: &Patch, config: &SgbmConfig) -> Result<Vec<bool>, RangeError> {
+fn target_mask(patch: &Patch, config: &RangeConfig) -> Result<Vec<bool>, RangeError> {
     let target = patch.target;
     let gate = config.mask.apply(&patch.left_bgr.roi(target)?)?;
     let floor = brightness_around(patch, config.context_px as i32)?;
@@ -437,7 +337,7 @@ fn gray(image: &Mat) -> opencv::Result<Gray> {
 /// unknown), and the share of the known pixels that have a value.
 #[cfg(test)]
 pub(super) fn mean_error_px(
-    config: &SgbmConfig,
+    config: &RangeConfig,
     left: &Mat,
     right: &Mat,
     truth: &Mat,

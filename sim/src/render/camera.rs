@@ -137,6 +137,20 @@ impl Lens {
         lens
     }
 
+    /// The same lens before a sensor with `fineness` times as many, smaller pixels a side.
+    pub(crate) fn finer(&self, fineness: usize) -> Self {
+        let k = fineness as f64;
+        // Pixel centres stand at whole numbers, edges at halves.
+        let centre = |c: f64| (c + 0.5) * k - 0.5;
+        Self {
+            width: self.width * fineness,
+            height: self.height * fineness,
+            focal_px: (self.focal_px.0 * k, self.focal_px.1 * k),
+            centre_px: (centre(self.centre_px.0), centre(self.centre_px.1)),
+            ..self.clone()
+        }
+    }
+
     fn corners(&self) -> [(f64, f64); 4] {
         let (w, h) = (self.width as f64, self.height as f64);
         [(0.0, 0.0), (w, 0.0), (0.0, h), (w, h)].map(|(u, v)| self.unproject(u, v))

@@ -64,7 +64,7 @@ impl RayGrid {
         }
     }
 
-    fn tangents(&self, column: usize, row: usize) -> (f64, f64) {
+    pub(super) fn tangents(&self, column: usize, row: usize) -> (f64, f64) {
         self.tangents[row * self.columns + column]
     }
 }

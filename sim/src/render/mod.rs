@@ -17,6 +17,7 @@ mod marks;
 mod sensor;
 mod solids;
 mod splats;
+pub mod studio;
 
 pub use camera::StereoCamera;
 pub use labels::LabelBox;

@@ -87,7 +87,7 @@ impl Sensor {
     }
 
     #[inline]
-    fn expose(&self, colour: [f32; 4], gain: f32, bits: u32, pixel: &mut [u8]) {
+    pub(super) fn expose(&self, colour: [f32; 4], gain: f32, bits: u32, pixel: &mut [u8]) {
         if let [blue, green, red] = pixel {
             *red = self.digital(colour[0] * gain, bits);
             *green = self.digital(colour[1] * gain, bits >> 10);

@@ -109,6 +109,15 @@ impl SeenSplat {
 
     #[inline]
     fn blend(&self, colour: &mut [f32; 4], cover: f32) {
+        let (added, kept) = self.given(cover);
+        for (c, own) in added.iter().enumerate() {
+            colour[c] = colour[c] * kept + own;
+        }
+    }
+
+    /// Light that it adds at a cover, and the share of the light behind that it lets through.
+    #[inline]
+    pub(super) fn given(&self, cover: f32) -> ([f32; 3], f32) {
         let alpha = self.alpha(cover);
         let (kept, added) = match self.kind {
             // Soot holds back less than it shines.
@@ -116,9 +125,12 @@ impl SeenSplat {
             SplatKind::Smoke => (1.0 - alpha, alpha),
             SplatKind::Light => (1.0, cover),
         };
-        for (c, own) in self.colour.iter().enumerate() {
-            colour[c] = colour[c] * kept + own * added;
-        }
+        (self.colour.map(|own| own * added), kept)
+    }
+
+    /// Half widths of the splat that a pixel spans.
+    pub(super) fn across_per_px(&self) -> f32 {
+        self.wide_per_px.0.hypot(self.wide_per_px.1)
     }
 }
 
