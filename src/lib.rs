@@ -12,6 +12,7 @@
 
 pub mod alarm;
 pub mod assess;
+pub mod boresight;
 pub mod cli;
 pub mod deliver;
 pub mod detect;

@@ -54,9 +54,8 @@ impl RawTerrain {
             Some(height) => {
                 checks.range("terrain.height_ellipsoid_m", height, -500.0, 9000.0, "");
             }
-            None => checks.problem(
-                "terrain.height_ellipsoid_m is missing, which a plane needs".to_owned(),
-            ),
+            None => checks
+                .problem("terrain.height_ellipsoid_m is missing, which a plane needs".to_owned()),
         }
         let of_tiles = [
             ("paths", !self.paths.is_empty()),
@@ -66,14 +65,17 @@ impl RawTerrain {
             ("reach_m", self.reach_m.is_some()),
         ];
         for (key, _) in of_tiles.iter().filter(|(_, set)| *set) {
-            checks.problem(format!("terrain.{key} is for kind \"tiles\", not for a plane"));
+            checks.problem(format!(
+                "terrain.{key} is for kind \"tiles\", not for a plane"
+            ));
         }
     }
 
     fn check_tiles(&self, checks: &mut Checks) {
         if self.paths.is_empty() {
             checks.problem(
-                "terrain.paths is missing: a list of GeoTIFF files or of folders of them".to_owned(),
+                "terrain.paths is missing: a list of GeoTIFF files or of folders of them"
+                    .to_owned(),
             );
         }
         if self.height_ellipsoid_m.is_some() {

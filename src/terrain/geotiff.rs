@@ -140,7 +140,9 @@ pub fn read(path: &Path, near: &Area) -> Result<Option<Window>, GeoTiffError> {
             most: MOST_PIXELS,
         });
     }
-    let samples = file.find_tag_unsigned(Tag::SamplesPerPixel)?.unwrap_or(1_u16);
+    let samples = file
+        .find_tag_unsigned(Tag::SamplesPerPixel)?
+        .unwrap_or(1_u16);
     if samples != 1 {
         return Err(GeoTiffError::Bands { samples });
     }
@@ -180,11 +182,11 @@ impl GeoKeys {
     const VERTICAL_UNITS: u32 = 4099;
 
     fn read(file: &mut Tiff) -> Result<Self, GeoTiffError> {
-        let directory: Vec<u32> = file
-            .find_tag_unsigned_vec(Tag::GeoKeyDirectoryTag)?
-            .ok_or(GeoTiffError::NoPlace {
-                tag: "GeoKeyDirectory",
-            })?;
+        let directory: Vec<u32> =
+            file.find_tag_unsigned_vec(Tag::GeoKeyDirectoryTag)?
+                .ok_or(GeoTiffError::NoPlace {
+                    tag: "GeoKeyDirectory",
+                })?;
         // Four numbers of header, then four a key: id, where its value lies (0: here), count, value.
         let entries = directory.chunks_exact(4).skip(1);
         Ok(Self(
@@ -196,7 +198,10 @@ impl GeoKeys {
     }
 
     fn get(&self, key: u32) -> Option<u32> {
-        self.0.iter().find(|(id, _)| *id == key).map(|(_, value)| *value)
+        self.0
+            .iter()
+            .find(|(id, _)| *id == key)
+            .map(|(_, value)| *value)
     }
 
     fn check_horizontal(&self) -> Result<(), GeoTiffError> {
@@ -208,7 +213,12 @@ impl GeoKeys {
                 vec![4326, 4979],
                 "EPSG 4326",
             ),
-            ("GeogAngularUnits", Self::ANGULAR_UNITS, vec![9102], "9102, degrees"),
+            (
+                "GeogAngularUnits",
+                Self::ANGULAR_UNITS,
+                vec![9102],
+                "9102, degrees",
+            ),
         ];
         for (key, id, allowed, expected) in checks {
             let found = match self.get(id) {
@@ -284,10 +294,11 @@ impl Grid {
                 column_pitch_deg: scale[0],
             });
         }
-        let matrix = numbers(file, Tag::ModelTransformationTag, "ModelTransformation", 16)?
-            .ok_or(GeoTiffError::NoPlace {
+        let matrix = numbers(file, Tag::ModelTransformationTag, "ModelTransformation", 16)?.ok_or(
+            GeoTiffError::NoPlace {
                 tag: "ModelPixelScale",
-            })?;
+            },
+        )?;
         if matrix[1] != 0.0 || matrix[4] != 0.0 || matrix[0] <= 0.0 || matrix[5] >= 0.0 {
             return Err(GeoTiffError::Turned);
         }

@@ -170,8 +170,9 @@ fn files(paths: &[PathBuf]) -> Result<Vec<PathBuf>, Vec<TerrainError>> {
 
 fn in_folder(path: &Path) -> Result<Vec<PathBuf>, TerrainError> {
     let is_tile = |file: &PathBuf| {
-        file.extension()
-            .is_some_and(|ending| ending.eq_ignore_ascii_case("tif") || ending.eq_ignore_ascii_case("tiff"))
+        file.extension().is_some_and(|ending| {
+            ending.eq_ignore_ascii_case("tif") || ending.eq_ignore_ascii_case("tiff")
+        })
     };
     let listed: std::io::Result<Vec<PathBuf>> = std::fs::read_dir(path)
         .and_then(|entries| entries.map(|entry| entry.map(|e| e.path())).collect());
@@ -202,7 +203,11 @@ fn tile(path: &Path, source: &TileSource) -> Result<Option<(Tile, usize)>, Terra
     };
     let datum = agreed(path, window.datum, source.datum)?;
     let posts = window.heights_m.len();
-    let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+    let name = path
+        .file_stem()
+        .unwrap_or_default()
+        .to_string_lossy()
+        .into_owned();
     let parts = TileParts {
         name,
         north_deg: window.north_deg,

@@ -192,7 +192,11 @@ struct Layer {
 }
 
 enum Item {
-    Splat { seen: SeenSplat, inverse_depth: Option<f32>, texel_px: f32 },
+    Splat {
+        seen: SeenSplat,
+        inverse_depth: Option<f32>,
+        texel_px: f32,
+    },
     Stick(Stick),
 }
 
@@ -218,7 +222,11 @@ impl Studio {
     #[must_use]
     pub fn new(world: Arc<World>, camera: StereoCamera) -> Self {
         let rays = [Eye::Left, Eye::Right].map(|eye| RayGrid::new(camera.lens(eye)));
-        Self { world, camera, rays }
+        Self {
+            world,
+            camera,
+            rays,
+        }
     }
 
     /// One eye's raw image: left in colour, right in grey.
@@ -232,8 +240,17 @@ impl Studio {
         let drawn = layer.extent.grown(AROUND_PX, view.lens);
         let light = self.light(shot, &view, &layer, &drawn);
         develop(&light, &drawn, &view, channels, &mut bytes);
-        let format = if channels == 3 { PixelFormat::Bgr8 } else { PixelFormat::Mono8 };
-        Frame { width: width as u32, height: height as u32, format, bytes }
+        let format = if channels == 3 {
+            PixelFormat::Bgr8
+        } else {
+            PixelFormat::Mono8
+        };
+        Frame {
+            width: width as u32,
+            height: height as u32,
+            format,
+            bytes,
+        }
     }
 
     /// What the left eye truly sees of the first flame; depth counts along `axis` (east, north, up;
@@ -250,7 +267,12 @@ impl Studio {
                 continue;
             }
             let (column, row) = layer.extent.place(index);
-            reach = [reach[0].min(column), reach[1].min(row), reach[2].max(column), reach[3].max(row)];
+            reach = [
+                reach[0].min(column),
+                reach[1].min(row),
+                reach[2].max(column),
+                reach[3].max(row),
+            ];
             sum += f64::from(lanes[5] / lanes[4]);
             pixels += 1;
             saturated += usize::from(lanes[0] * gain > 1.0);
@@ -265,7 +287,12 @@ impl Studio {
     }
 
     fn view<'a>(&'a self, shot: &Shot, eye: Eye, look: &'a Look) -> View<'a> {
-        View { eye, look, pose: self.camera.pose(eye, &shot.body), lens: self.camera.lens(eye) }
+        View {
+            eye,
+            look,
+            pose: self.camera.pose(eye, &shot.body),
+            lens: self.camera.lens(eye),
+        }
     }
 
     /// Everything before the backdrop.
@@ -275,7 +302,12 @@ impl Studio {
         let mut items = self.items(shot, view, &lens, axis);
         items.sort_by(|a, b| b.depth_m().total_cmp(&a.depth_m()));
         let fine = items.iter().map(Item::extent).reduce(|a, b| a.with(&b));
-        let fine = fine.unwrap_or(PixelBox { left: 0, top: 0, right: 1, bottom: 1 });
+        let fine = fine.unwrap_or(PixelBox {
+            left: 0,
+            top: 0,
+            right: 1,
+            bottom: 1,
+        });
         let extent = fine.coarser(fineness);
         let (columns, rows) = (extent.columns() * fineness, extent.rows() * fineness);
         let origin = (extent.left * fineness, extent.top * fineness);
@@ -283,20 +315,39 @@ impl Studio {
         for item in &items {
             item.draw(&mut lanes, origin, columns, self.world.textures());
         }
-        Layer { pixels: averaged(&lanes, columns, fineness), extent }
+        Layer {
+            pixels: averaged(&lanes, columns, fineness),
+            extent,
+        }
     }
 
-    fn items(&self, shot: &Shot, view: &View, lens: &Lens, axis: Option<&Vector3<f64>>) -> Vec<Item> {
+    fn items(
+        &self,
+        shot: &Shot,
+        view: &View,
+        lens: &Lens,
+        axis: Option<&Vector3<f64>>,
+    ) -> Vec<Item> {
         let t_s = shot.t_s + view.look.skew_s;
         let mut items = Vec::new();
         for (k, fire) in shot.fires.iter().enumerate() {
             let axis = axis.filter(|_| k == 0);
             let splats = fire.flame(t_s).splats();
-            items.extend(splats.iter().filter_map(|splat| view.item(splat, lens, axis)));
+            items.extend(
+                splats
+                    .iter()
+                    .filter_map(|splat| view.item(splat, lens, axis)),
+            );
         }
-        let puffs = shot.puffs.iter().filter(|puff| puff.only.is_none_or(|eye| eye == view.eye));
+        let puffs = shot
+            .puffs
+            .iter()
+            .filter(|puff| puff.only.is_none_or(|eye| eye == view.eye));
         items.extend(puffs.filter_map(|puff| view.item(&puff.splat(), lens, None)));
-        let sticks = shot.branches.iter().filter_map(|branch| Stick::new(branch, &view.pose, lens));
+        let sticks = shot
+            .branches
+            .iter()
+            .filter_map(|branch| Stick::new(branch, &view.pose, lens));
         items.extend(sticks.map(Item::Stick));
         items
     }
@@ -362,7 +413,11 @@ impl View<'_> {
         let inverse_depth =
             axis.map(|axis| (1.0 / (splat.centre_m - self.pose.origin_m).dot(axis)) as f32);
         let seen_px = seen.across_per_px();
-        Some(Item::Splat { seen, inverse_depth, texel_px: seen_px })
+        Some(Item::Splat {
+            seen,
+            inverse_depth,
+            texel_px: seen_px,
+        })
     }
 }
 
@@ -433,7 +488,10 @@ impl PixelBox {
 
     /// Column and row of a pixel, row by row.
     fn place(&self, index: usize) -> (usize, usize) {
-        (self.left + index % self.columns(), self.top + index / self.columns())
+        (
+            self.left + index % self.columns(),
+            self.top + index / self.columns(),
+        )
     }
 }
 
@@ -453,7 +511,13 @@ impl Item {
     }
 
     /// Draws it over what is there.
-    fn draw(&self, lanes: &mut [Lanes], origin: (usize, usize), columns: usize, textures: &Textures) {
+    fn draw(
+        &self,
+        lanes: &mut [Lanes],
+        origin: (usize, usize),
+        columns: usize,
+        textures: &Textures,
+    ) {
         let extent = self.extent();
         let billows = match self {
             Self::Splat { texel_px, .. } => textures.billows.lod(BILLOW_SHARE * texel_px),
@@ -464,7 +528,11 @@ impl Item {
             for px in extent.left..extent.right {
                 let pixel = &mut lanes[line + px - origin.0];
                 match self {
-                    Self::Splat { seen, inverse_depth, .. } => {
+                    Self::Splat {
+                        seen,
+                        inverse_depth,
+                        ..
+                    } => {
                         let cover = seen.cover(px, py, &billows);
                         if cover > 0.002 {
                             seen.lay_over(pixel, cover, *inverse_depth);
@@ -541,12 +609,21 @@ impl<'a> BackdropView<'a> {
                     [0, 1, 2].map(|k| left.enu_from_camera.column(k).into_owned());
                 [left.origin_m + ahead * depth_m, ahead, right, down]
             }
-            Backdrop::Ground { up_m } => {
-                [Vector3::z() * up_m, -Vector3::z(), Vector3::x(), Vector3::y()]
-            }
+            Backdrop::Ground { up_m } => [
+                Vector3::z() * up_m,
+                -Vector3::z(),
+                Vector3::x(),
+                Vector3::y(),
+            ],
         };
         let rays = &studio.rays[usize::from(view.eye == Eye::Right)];
-        Self { studio, shot, view, rays, plane }
+        Self {
+            studio,
+            shot,
+            view,
+            rays,
+            plane,
+        }
     }
 
     /// Linear light of a pixel.
@@ -561,7 +638,12 @@ impl<'a> BackdropView<'a> {
         }
         let place = self.view.pose.origin_m + ray * depth - point;
         let footprint = (depth / self.view.lens.focal_px.0) as f32;
-        self.albedo(place.dot(&across) as f32, place.dot(&down) as f32, footprint).map(|a| a * light)
+        self.albedo(
+            place.dot(&across) as f32,
+            place.dot(&down) as f32,
+            footprint,
+        )
+        .map(|a| a * light)
     }
 
     fn albedo(&self, x: f32, y: f32, footprint_m: f32) -> [f32; 3] {
@@ -588,13 +670,16 @@ fn blurred(light: Vec<[f32; 3]>, columns: usize, look: &Look) -> Vec<[f32; 3]> {
     let wide = gaussian(&light, columns, GLARE_PX);
     let glare = look.glare as f32;
     let mixed = sharp.iter().zip(&wide);
-    mixed.map(|(s, w)| std::array::from_fn(|c| s[c] + glare * (w[c] - s[c]))).collect()
+    mixed
+        .map(|(s, w)| std::array::from_fn(|c| s[c] + glare * (w[c] - s[c])))
+        .collect()
 }
 
 fn gaussian(light: &[[f32; 3]], columns: usize, sigma_px: f64) -> Vec<[f32; 3]> {
     let reach = (3.0 * sigma_px).ceil() as isize;
-    let weights: Vec<f32> =
-        (-reach..=reach).map(|k| (-0.5 * (k as f64 / sigma_px).powi(2)).exp() as f32).collect();
+    let weights: Vec<f32> = (-reach..=reach)
+        .map(|k| (-0.5 * (k as f64 / sigma_px).powi(2)).exp() as f32)
+        .collect();
     let total: f32 = weights.iter().sum();
     let rows = (light.len() / columns) as isize;
     let pass = |from: &[[f32; 3]], step: (isize, isize)| -> Vec<[f32; 3]> {
@@ -627,12 +712,21 @@ fn develop(light: &[[f32; 3]], drawn: &PixelBox, view: &View, channels: usize, b
     });
     for (index, colour) in light.iter().enumerate() {
         let (column, row) = drawn.place(index);
-        let passing: f64 = look.dirt.iter().map(|smudge| smudge.passing(column, row)).product();
+        let passing: f64 = look
+            .dirt
+            .iter()
+            .map(|smudge| smudge.passing(column, row))
+            .product();
         let bits = hash(look.seed, column as u32, row as u32) as u32;
         let offset = (row * view.lens.width + column) * channels;
         let [red, green, blue] = *colour;
         let gain = (look.gain * passing) as f32;
-        sensor.expose([red, green, blue, green], gain, bits, &mut bytes[offset..offset + channels]);
+        sensor.expose(
+            [red, green, blue, green],
+            gain,
+            bits,
+            &mut bytes[offset..offset + channels],
+        );
     }
 }
 
@@ -651,8 +745,8 @@ impl RayGrid {
             (column % BLOCK) as f64 / BLOCK as f64,
             (row % BLOCK) as f64 / BLOCK as f64,
         );
-        let [a, b, c, d] = [(0, 0), (1, 0), (0, 1), (1, 1)]
-            .map(|(dx, dy)| self.tangents(left + dx, top + dy));
+        let [a, b, c, d] =
+            [(0, 0), (1, 0), (0, 1), (1, 1)].map(|(dx, dy)| self.tangents(left + dx, top + dy));
         let between = |a: f64, b: f64, c: f64, d: f64| {
             (a * (1.0 - x) + b * x) * (1.0 - y) + (c * (1.0 - x) + d * x) * y
         };

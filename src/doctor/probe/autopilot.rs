@@ -98,7 +98,7 @@ impl AutopilotSeen {
     #[must_use]
     pub fn place(&self) -> Option<Wgs84> {
         let place = self.gnss?.place?;
-        let mut geoid = emberfix_frames::Geoid::new();
+        let geoid = emberfix_frames::Geoid::new();
         let height: EllipsoidHeight = place.height.unwrap_or_else(|| {
             place.altitude + geoid.undulation(place.latitude_deg, place.longitude_deg)
         });

@@ -9,9 +9,7 @@
 //! there), the mission's allowance for canopy, and the datum's.
 
 use super::{Ground, Terrain};
-use emberfix_frames::{
-    EllipsoidHeight, Geoid, GeoidUndulation, MslAltitude, Wgs84, Wgs84Parts,
-};
+use emberfix_frames::{EllipsoidHeight, Geoid, GeoidUndulation, MslAltitude, Wgs84, Wgs84Parts};
 
 /// The surface from which a tile's heights count.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -237,8 +235,7 @@ impl Tile {
         let from_middle = (longitude_deg - middle_deg + 180.0).rem_euclid(360.0) - 180.0;
         let row = (p.north_deg - latitude_deg) / p.row_pitch_deg;
         let column = middle + from_middle / p.column_pitch_deg;
-        let inside =
-            |at: f64, count: usize| (-beyond..=(count - 1) as f64 + beyond).contains(&at);
+        let inside = |at: f64, count: usize| (-beyond..=(count - 1) as f64 + beyond).contains(&at);
         (inside(row, p.rows) && inside(column, p.columns)).then_some((row, column))
     }
 
@@ -273,7 +270,11 @@ impl Tile {
         let west = self.parts.west_deg;
         let from_west = longitude_deg - west;
         // A place on the edge may round to just west of it.
-        west + if from_west < -1.0 { from_west + 360.0 } else { from_west }
+        west + if from_west < -1.0 {
+            from_west + 360.0
+        } else {
+            from_west
+        }
     }
 
     fn sigma_m(&self, row: usize, column: usize, corners: [f64; 4]) -> f64 {
@@ -317,7 +318,11 @@ impl Tile {
                 }
             }
         }
-        if count == 0 { 0.0 } else { (sum / f64::from(count)).sqrt() }
+        if count == 0 {
+            0.0
+        } else {
+            (sum / f64::from(count)).sqrt()
+        }
     }
 
     fn steepest_cell(&self) -> f64 {
