@@ -31,7 +31,8 @@ impl Cameras {
         flight: Arc<Flight>,
         errors: &ErrorsConfig,
     ) -> Self {
-        let camera = StereoCamera::new(&mission.rig);
+        let camera = StereoCamera::new(&mission.rig)
+            .with_mount_error(mission.sim.camera.mount_error_deg.map(f64::to_radians));
         Self {
             renderer: Renderer::new(
                 world,

@@ -107,6 +107,9 @@ pub struct CameraConfig {
     /// From mid-exposure to the pair's arrival, seconds.
     #[serde(default = "default_latency_s")]
     pub latency_s: f64,
+    /// How the camera truly stands, beyond what the rig file says: yaw, depression, roll.
+    #[serde(default)]
+    pub mount_error_deg: [f64; 3],
 }
 
 fn default_quality() -> u8 {
@@ -291,6 +294,10 @@ fn check_sim(checks: &mut Checks, sim: &SimConfig) {
         100.0,
     );
     checks.range("sim.camera.latency_s", sim.camera.latency_s, 0.0, 2.0);
+    for (axis, error) in sim.camera.mount_error_deg.iter().enumerate() {
+        let key = format!("sim.camera.mount_error_deg[{axis}]");
+        checks.range(&key, *error, -45.0, 45.0);
+    }
     checks.range(
         "sim.autopilot.booted_before_s",
         sim.autopilot.booted_before_s,

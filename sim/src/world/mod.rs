@@ -18,7 +18,7 @@ mod texture;
 mod things;
 
 pub use config::{
-    FireConfig, GroundCover, LightConfig, LookalikeConfig, LookalikeKind, SmokeConfig,
+    BoardConfig, FireConfig, GroundCover, LightConfig, LookalikeConfig, LookalikeKind, SmokeConfig,
     SpreadConfig, TerrainConfig, TreesConfig, WindConfig, WorldConfig,
 };
 
@@ -158,6 +158,7 @@ impl World {
             terrain,
         };
         world.place_lookalikes(&config.lookalikes);
+        world.place_boards(&config.boards);
         world.place_trees(config);
         world.scorch();
         Ok(world)
@@ -357,6 +358,13 @@ impl World {
         }
     }
 
+    fn place_boards(&mut self, boards: &[BoardConfig]) {
+        for board in boards {
+            let foot = self.foot(board.east_m, board.north_m);
+            self.things.add_board(foot, board);
+        }
+    }
+
     fn place_trees(&mut self, config: &WorldConfig) {
         let sun = self.sun();
         let mut rng = ChaCha8Rng::seed_from_u64(config.trees.seed ^ self.seed.rotate_left(17));
@@ -401,9 +409,11 @@ fn places(config: &WorldConfig) -> Vec<Vector2<f64>> {
     let fires = config.fires.iter().map(|f| (f.east_m, f.north_m));
     let smokes = config.smokes.iter().map(|s| (s.east_m, s.north_m));
     let lookalikes = config.lookalikes.iter().map(|l| (l.east_m, l.north_m));
+    let boards = config.boards.iter().map(|b| (b.east_m, b.north_m));
     fires
         .chain(smokes)
         .chain(lookalikes)
+        .chain(boards)
         .map(|(east, north)| Vector2::new(east, north))
         .collect()
 }
@@ -464,6 +474,13 @@ fn check(config: &WorldConfig) -> Result<(), WorldError> {
         let key = |name: &str| format!("lookalikes[{k}].{name}");
         check_place(&key, thing.east_m, thing.north_m)?;
         range(&key("size_m"), thing.size_m, 0.02, 100.0)?;
+    }
+    for (k, board) in config.boards.iter().enumerate() {
+        let key = |name: &str| format!("boards[{k}].{name}");
+        check_place(&key, board.east_m, board.north_m)?;
+        range(&key("columns"), f64::from(board.columns), 2.0, 20.0)?;
+        range(&key("rows"), f64::from(board.rows), 2.0, 20.0)?;
+        range(&key("square_m"), board.square_m, 0.01, 5.0)?;
     }
     check_surroundings(config)
 }

@@ -479,6 +479,10 @@ function connect() {
   on("time", (time) => setClock(time.now));
   on("alarm", (feature, event) => { lastId = event.lastEventId; takeAlarm(feature); });
   on("track", takePosition);
+  on("test", ({ at, link, uav }) => {
+    $("tested-text").textContent = `${new Date(at).toLocaleTimeString("en-GB")}: test alarm from ${uav} over ${link} arrived. There is no fire.`;
+    $("tested").hidden = false;
+  });
   on("refused", ({ at, link, reason }) => {
     $("refused-text").textContent = `${new Date(at).toLocaleTimeString("en-GB")}: a report over ${link} was not taken. ${reason}`;
     $("refused").hidden = false;
@@ -567,6 +571,7 @@ function point([px, py]) {
 }
 
 function fit() { view.following = true; draw(); }
+$("tested-seen").addEventListener("click", () => { $("tested").hidden = true; });
 $("refused-seen").addEventListener("click", () => { $("refused").hidden = true; });
 $("fit").addEventListener("click", fit);
 $("zoom-in").addEventListener("click", () => zoom(1.5));
