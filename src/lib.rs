@@ -26,6 +26,7 @@ pub mod range;
 pub mod record;
 pub mod replay;
 pub mod service;
+pub mod terrain;
 pub mod track;
 
 #[cfg(test)]

@@ -2,8 +2,8 @@
 
 use crate::inverse_depth::{OFFSETS_PER_M, SCALES};
 use crate::{
-    Camera, Checks, Eye, InverseDepth, KeyProblem, Rectification, Rig, RigSigmas, toml_problem,
-    unknown_keys,
+    Calibrated, Camera, Checks, Finding, InverseDepth, KeyProblem, Rectification, Rig, RigSigmas,
+    Severity, implausible, toml_problem, unknown_keys,
 };
 use emberfix_frames::{Metres, MountAngles, Vector, Vector3};
 use serde::Deserialize;
@@ -57,6 +57,7 @@ struct RawRig {
     sigma: RawSigma,
     #[serde(default)]
     inverse_depth: RawInverseDepth,
+    calibrated: Option<RawCalibrated>,
 }
 
 #[derive(Deserialize)]
@@ -85,6 +86,8 @@ struct RawMount {
 #[derive(Deserialize)]
 struct RawTime {
     camera_offset_s: f64,
+    #[serde(default)]
+    rolling_readout_s: f64,
 }
 
 #[derive(Deserialize)]
@@ -114,6 +117,15 @@ impl Default for RawInverseDepth {
     }
 }
 
+#[derive(Deserialize)]
+struct RawCalibrated {
+    at: String,
+    pairs: usize,
+    rms_px: f64,
+    held_out_rms_px: f64,
+    range_sigma_at_10m_percent: f64,
+}
+
 const KNOWN: &[&str] = &[
     "name",
     "left.image_size_px",
@@ -132,6 +144,7 @@ const KNOWN: &[&str] = &[
     "mount.roll_deg",
     "mount.lever_arm_m",
     "time.camera_offset_s",
+    "time.rolling_readout_s",
     "sigma.disparity_bias_px",
     "sigma.boresight_deg",
     "sigma.lever_arm_m",
@@ -139,6 +152,11 @@ const KNOWN: &[&str] = &[
     "inverse_depth.scale",
     "inverse_depth.offset_per_m",
     "inverse_depth.covariance",
+    "calibrated.at",
+    "calibrated.pairs",
+    "calibrated.rms_px",
+    "calibrated.held_out_rms_px",
+    "calibrated.range_sigma_at_10m_percent",
 ];
 
 pub(crate) fn load(path: &Path) -> Result<Rig, RigError> {
@@ -204,6 +222,13 @@ fn check(raw: &RawRig) -> Vec<String> {
         -2.0,
         2.0,
         " (seconds)",
+    );
+    checks.range(
+        "time.rolling_readout_s",
+        raw.time.rolling_readout_s,
+        0.0,
+        0.2,
+        " (0 is a global shutter)",
     );
     let sigma = &raw.sigma;
     checks.range(
@@ -353,13 +378,15 @@ fn build(raw: RawRig, path: &Path) -> Result<Rig, RigError> {
             path: path.to_owned(),
             source,
         })?;
-    let turned_deg = rectification.turn_rad(Eye::Left).to_degrees();
-    if turned_deg > MAX_TURN_DEG {
-        let problem = format!(
-            "rectification turns the left eye by {turned_deg:.1} degrees, allowed is {MAX_TURN_DEG}; \
-             calibrate again: a rig whose eyes look along parallel axes needs less than one"
-        );
-        return Err(values(path, vec![problem]));
+    let findings = implausible(&left, &right, &rectification, &translation_m);
+    if findings
+        .iter()
+        .any(|found| found.severity == Severity::Refusal)
+    {
+        return Err(values(
+            path,
+            findings.iter().map(Finding::to_string).collect(),
+        ));
     }
     Ok(Rig {
         name: raw.name,
@@ -374,6 +401,7 @@ fn build(raw: RawRig, path: &Path) -> Result<Rig, RigError> {
         },
         lever_arm: Vector::from_metres(Vector3::from(raw.mount.lever_arm_m)),
         time_offset_s: raw.time.camera_offset_s,
+        rolling_readout_s: raw.time.rolling_readout_s,
         max_skew_s: raw.stereo.max_skew_s,
         sigmas: RigSigmas {
             disparity_bias_px: raw.sigma.disparity_bias_px,
@@ -387,12 +415,20 @@ fn build(raw: RawRig, path: &Path) -> Result<Rig, RigError> {
             covariance: raw.inverse_depth.covariance,
         },
         rectification,
+        calibrated: raw.calibrated.map(calibrated),
+        doubts: findings,
     })
 }
 
-/// Beyond this a rig is bent or its calibration wrong. P4 printed a rig that turns by 6.9 degrees, since
-/// one of its eyes stands 15 mm behind the other, and ranged with it.
-const MAX_TURN_DEG: f64 = 8.0;
+fn calibrated(raw: RawCalibrated) -> Calibrated {
+    Calibrated {
+        at: raw.at,
+        pairs: raw.pairs,
+        rms_px: raw.rms_px,
+        held_out_rms_px: raw.held_out_rms_px,
+        range_sigma_at_10m_percent: raw.range_sigma_at_10m_percent,
+    }
+}
 
 fn camera(raw: &RawCamera) -> Camera {
     let [width, height] = raw.image_size_px;

@@ -5,18 +5,27 @@
 //! **Out:** pixels to rectified pixels, rectified pixels to rays, camera to body.
 //!
 //! **Assumptions.** Pinhole cameras with OpenCV's five-term distortion (k1 k2 p1 p2 k3), pixel
-//! centres at whole numbers. **Known limits.** No fisheye, no rolling-shutter model.
+//! centres at whole numbers. **Known limits.** No fisheye; a rolling shutter has a time
+//! but no model.
 
+pub mod exchange;
 mod file;
 mod inverse_depth;
 mod nearest;
+mod page;
+mod parts;
+mod plausible;
 mod rectify;
+pub mod solve;
 #[cfg(test)]
 mod tests;
 
 pub use file::RigError;
 pub use inverse_depth::{InverseDepth, InverseDepthError, Reading};
 pub use nearest::{Checks, KeyProblem, nearest_key, toml_problem, unknown_keys};
+pub use page::{PageInput, page};
+pub use parts::{Calibrated, Mounting, RigParts, mount_angles};
+pub use plausible::{Finding, MAX_K3, MAX_TURN_DEG, Severity, implausible};
 pub use rectify::Rectification;
 
 use emberfix_frames::{
@@ -90,10 +99,13 @@ pub struct Rig {
     mount: MountAngles,
     lever_arm: Vector<BodyFrd>,
     time_offset_s: f64,
+    rolling_readout_s: f64,
     max_skew_s: f64,
     sigmas: RigSigmas,
     inverse_depth: InverseDepth,
     rectification: Rectification,
+    calibrated: Option<Calibrated>,
+    doubts: Vec<Finding>,
 }
 
 impl Rig {
@@ -156,6 +168,11 @@ impl Rig {
     pub fn time_offset_s(&self) -> f64 {
         self.time_offset_s
     }
+    /// From the exposure of the first row to that of the last, seconds; 0 for a global shutter.
+    #[must_use]
+    pub fn rolling_readout_s(&self) -> f64 {
+        self.rolling_readout_s
+    }
     /// Greatest difference of the eyes' exposures that still counts as one moment, seconds.
     #[must_use]
     pub fn max_skew_s(&self) -> f64 {
@@ -165,6 +182,16 @@ impl Rig {
     #[must_use]
     pub fn sigmas(&self) -> &RigSigmas {
         &self.sigmas
+    }
+    /// What the calibration said of itself, if the file tells.
+    #[must_use]
+    pub fn calibrated(&self) -> Option<&Calibrated> {
+        self.calibrated.as_ref()
+    }
+    /// What is implausible, yet no reason to refuse the rig.
+    #[must_use]
+    pub fn doubts(&self) -> &[Finding] {
+        &self.doubts
     }
     /// The rectified pair's geometry and the way into it.
     #[must_use]

@@ -138,7 +138,7 @@ fn egm96_agrees_with_the_published_undulations() {
         "/../tests/data/geo/egm96_nga_points.csv"
     );
     let text = std::fs::read_to_string(path).unwrap();
-    let mut geoid = Geoid::new();
+    let geoid = Geoid::new();
     let mut checked = 0;
     for line in text.lines().filter(|line| !line.starts_with('#')).skip(1) {
         let fields: Vec<f64> = line

@@ -3,6 +3,11 @@
 //! **In:** sightings and the fire's position. **Out:** [`SizeM`] in metres; whether a light flickers.
 //! **Known limits.** Intensity and trend are not assessed yet, and the alarm says so with `null`.
 
+pub mod extent;
+pub mod fusion;
+pub mod outline;
+pub mod printed;
+
 use crate::alarm::SizeM;
 use crate::locate::{Sighting, View};
 use emberfix_frames::{ServiceTime, Vector3};

@@ -9,10 +9,15 @@
 //! its covariance, but only [`crate::track`] knows that they do not average out.
 
 mod geometry;
+mod shared;
 mod terrain;
 
-pub use geometry::{SHARED, Shared, SharedSigmas, View};
-pub use terrain::{ConstantPlane, Terrain, TerrainHit, meet_terrain};
+pub use geometry::{Distant, Lens, Linear, Motion, Predicted, View, range_beneath};
+pub use shared::{CONSTANT, SHARED, Shared, SharedPriors, WANDERING};
+pub use terrain::{
+    Area, ConstantPlane, Coverage, Ground, Terrain, TerrainHit, Tile, TileError, TileParts,
+    TileSigmas, Tiles, VerticalDatum, meet_terrain,
+};
 
 use crate::alarm::Method;
 use emberfix_calib::RectifiedPixel;
@@ -82,7 +87,7 @@ pub fn fix(sighting: &Sighting, view: &View<'_>, terrain: Option<&dyn Terrain>) 
         .and_then(|d| stereo_range(sighting, &d, view));
     let on_ground = terrain.and_then(|t| match meet_terrain(&view.camera_enu, &ray, t, view) {
         TerrainHit::Met { range_m, sigma_m } => Some((range_m, sigma_m)),
-        TerrainHit::Above | TerrainHit::Grazing | TerrainHit::Unknown => None,
+        _ => None,
     });
     let on_ground = on_ground.filter(|(range, _)| {
         sighting

@@ -11,7 +11,7 @@ use rand_chacha::ChaCha8Rng;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
 #[serde(rename_all = "snake_case")]
 pub(super) enum Hardness {
-    /// Cores without texture, a glow in the lens, lamps as bright beside it.
+    /// Cores without texture at night, a glow and ghosts in each lens, lamps as bright beside it.
     SaturatedCore,
     /// The eyes expose 8 to 25 ms apart.
     Flicker,
@@ -77,8 +77,8 @@ impl Hardness {
         };
         match self {
             Self::SaturatedCore => Recipe {
-                exposure: 5.0..20.0,
-                daylight: 0.005..0.08,
+                exposure: 5.0..40.0,
+                daylight: 0.0..0.03,
                 ..usual
             },
             // The flame's left part is cut off in the right eye or in both.
@@ -132,15 +132,28 @@ fn lamps(stage: &Stage, set_up: &mut SetUp, rng: &mut ChaCha8Rng) {
     }
     let (middle, right, up) = frame_of(stage, set_up);
     let fire = set_up.target();
-    for _ in 0..rng.random_range(0..4) {
+    for _ in 0..rng.random_range(1..5) {
         let aside = fire.width_m * rng.random_range(0.8..2.5) * side(rng);
         let high = fire.height_m * rng.random_range(-0.3..0.3);
         let nearer = rng.random_range(0.9..1.3);
         set_up.add_puff(Puff {
             centre_m: (middle + right * aside + up * high) * nearer,
-            radius_m: fire.width_m * rng.random_range(0.15..0.35),
+            radius_m: fire.width_m * rng.random_range(0.2..0.6),
             kind: PuffKind::Light { strength: 4.0 },
             only: None,
+        });
+    }
+    // What a lens mirrors within itself stands elsewhere in each eye.
+    for only in [Eye::Left, Eye::Right, Eye::Right] {
+        let aside = fire.width_m * rng.random_range(-1.2..1.2);
+        let high = fire.height_m * rng.random_range(-0.6..0.6);
+        set_up.add_puff(Puff {
+            centre_m: middle + right * aside + up * high,
+            radius_m: fire.width_m * rng.random_range(0.1..0.4),
+            kind: PuffKind::Light {
+                strength: rng.random_range(0.01..0.2),
+            },
+            only: Some(only),
         });
     }
 }

@@ -111,6 +111,23 @@ impl FullFrame {
         })
     }
 
+    /// The median under our mask of a whole frame that was matched before.
+    #[cfg(test)]
+    pub(super) fn median_in(
+        &self,
+        disparities: &Mat,
+        pair: &RawPair,
+        box_px: &BoxPx,
+    ) -> Result<Option<f64>, RangeEvalError> {
+        let Some(target) = self.rectified(box_px)? else {
+            return Ok(None);
+        };
+        let whole = Rect::new(0, 0, self.left.0.cols(), self.left.0.rows());
+        let left_bgr = remapped(&pair.left_bgr, &self.left, whole)?;
+        let gate = HsvMask::flame();
+        Ok(median(&masked(disparities, &left_bgr, target, &gate)?))
+    }
+
     fn matched(
         &mut self,
         pair: &RawPair,

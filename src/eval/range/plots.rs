@@ -68,7 +68,7 @@ fn sigma(table: &Measured) -> Chart {
 fn error(table: &Measured) -> Chart {
     let axes = (
         Axis::log("range, m"),
-        Axis::log("mean error, % of the range"),
+        Axis::log("mean error, % of the range").within(0.05, 2000.0),
     );
     let mut chart = Chart::new(format!("{}: error", table.series.name), axes.0, axes.1);
     for method in 0..NAMES.len() {
@@ -97,7 +97,7 @@ fn subpixel(steps: &[Step]) -> Chart {
     let mut chart = Chart::new(
         "Bias over the fraction of a pixel",
         Axis::linear("fraction of the disparity, px"),
-        Axis::linear("mean error, px"),
+        Axis::linear("mean error, px").within(-0.4, 0.6),
     );
     for method in 0..FULL_FRAME.end {
         let points = steps

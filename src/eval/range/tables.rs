@@ -1,6 +1,6 @@
 //! Ranges at stated distances: the papers' tables and ours.
 
-use super::outcome::{BEST, Bench, NAMES, Round};
+use super::outcome::{BEST, Bench, NAMES, Round, Said};
 use super::stage::{Recipe, RigName, Stage};
 use super::stats::{deviation, half_interval95, mean, rms};
 use super::{Options, RangeEvalError, Tick};
@@ -135,6 +135,16 @@ impl Series {
         self.printed_percent.get(place).copied()
     }
 
+    /// Takes a range to what it would be of the stated distance. A level rig sees all of an upright
+    /// flame at one depth; where it looks down, each row has a depth of its own.
+    fn scale(&self, distance_m: f64, round: &Round, said: &Said) -> f64 {
+        if self.indoors {
+            1.0
+        } else {
+            distance_m / round.truth.depth_m(said.truth_px)
+        }
+    }
+
     fn columns(&self) -> std::ops::Range<f64> {
         if self.rig == RigName::P4 {
             215.0..290.0
@@ -217,7 +227,10 @@ impl Cell {
                 .map(move |round| (round, &round.said[method]))
         };
         let ranges: Vec<f64> = said()
-            .filter_map(|(round, said)| Some(round.truth.depth_m(said.measured_px()?)))
+            .filter_map(|(round, said)| {
+                let found_m = round.truth.depth_m(said.measured_px()?);
+                Some(found_m * series.scale(self.distance_m, round, said))
+            })
             .collect();
         let percent = |range: f64| 100.0 * (range - self.distance_m) / self.distance_m;
         let errors: Vec<f64> = ranges.iter().map(|range| percent(*range).abs()).collect();

@@ -1,0 +1,97 @@
+//! A real rig's pictures (`../shared/data/stereo/chess_a`): 29 pairs, 640x360, 9x6 corners, 24.23 mm.
+
+use emberfix_calib::solve::{
+    Board, StereoSolution, View, cross_validate, find_corners, make_consistent, range_errors,
+    read_grey, solve,
+};
+use std::path::PathBuf;
+
+fn folder() -> Option<PathBuf> {
+    let root = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("..");
+    let shared =
+        std::env::var_os("EMBERFIX_SHARED").map_or_else(|| root.join("../shared"), PathBuf::from);
+    let folder = shared.join("data/stereo/chess_a");
+    if !folder.exists() {
+        println!("skipped: no shared data");
+        return None;
+    }
+    Some(folder)
+}
+
+fn board() -> Board {
+    Board::parse("9x6", 0.02423).unwrap()
+}
+
+fn views() -> Option<Vec<View>> {
+    let folder = folder()?;
+    let corners = |name: String| {
+        let image = read_grey(&folder.join(name)).unwrap().unwrap();
+        find_corners(&image, &board()).unwrap()
+    };
+    let mut views = Vec::new();
+    for number in 1..=29 {
+        let left = corners(format!("left{number:02}.jpg"));
+        let right = corners(format!("right{number:02}.jpg"));
+        if let (Some(left), Some(right)) = (left, right) {
+            let name = format!("{number:02}");
+            views.push(make_consistent(&board(), View { name, left, right }));
+        }
+    }
+    Some(views)
+}
+
+fn solved(views: &[View]) -> StereoSolution {
+    solve(&board(), views, (640, 360)).unwrap()
+}
+
+#[test]
+fn the_real_rig_comes_out_as_others_found_it() {
+    let Some(views) = views() else { return };
+    assert_eq!(views.len(), 29, "the board is in all 58 images");
+    let solution = solved(&views);
+    println!(
+        "rms {} baseline {} +- {} corner sigma {:?} widened {} {:?} {:?}",
+        solution.rms_px(),
+        solution.baseline_m(),
+        solution.baseline_sigma_m(),
+        solution.corner_sigma_px,
+        solution.widened_by,
+        solution.left,
+        solution.right
+    );
+    println!("{:?}", cross_validate(&board(), &views, &solution).unwrap());
+    println!(
+        "{:?}",
+        range_errors(&solution, &[5.0, 10.0, 30.0, 100.0]).unwrap()
+    );
+    assert!(solution.rms_px() <= 0.26, "{}", solution.rms_px());
+    assert!((solution.baseline_m() - 0.0940).abs() < 0.0005);
+}
+
+#[test]
+fn halves() {
+    let Some(views) = views() else { return };
+    let solution = solved(&views);
+    let mut seed = 12345_u64;
+    let mut b = vec![];
+    for _ in 0..100 {
+        let mut idx: Vec<usize> = (0..29).collect();
+        for i in (1..29).rev() {
+            seed = seed
+                .wrapping_mul(6364136223846793005)
+                .wrapping_add(1442695040888963407);
+            idx.swap(i, (seed >> 33) as usize % (i + 1));
+        }
+        for half in [&idx[..14], &idx[14..]] {
+            let s = emberfix_calib::solve::solve_again(&board(), &views, &solution, half).unwrap();
+            b.push((s.baseline_m() - solution.baseline_m()) * 1e3);
+        }
+    }
+    let m = b.iter().sum::<f64>() / 200.0;
+    let sd = (b.iter().map(|x| (x - m).powi(2)).sum::<f64>() / 199.0).sqrt();
+    b.sort_by(f64::total_cmp);
+    println!(
+        "mean {m} sd {sd} min {} max {} p95 {}",
+        b[0], b[199], b[190]
+    );
+}
