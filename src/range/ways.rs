@@ -6,7 +6,7 @@ use super::scene::{Scene, Search};
 use super::sgbm::SemiGlobal;
 use super::{
     Method, Methods, Miss, RangeConfig, RangeError, Ranger, Ranging, RawPair, Target, best,
-    centroid, correlate,
+    centroid, correlate, cross_spectral,
 };
 use emberfix_calib::Rig;
 
