@@ -31,7 +31,6 @@ use emberfix_frames::{
 };
 use emberfix_mav::telemetry::{GpsRaw, TimeSyncMessage};
 use emberfix_mav::{Address, Received, SystemId, Telemetry};
-use std::cell::RefCell;
 use std::sync::Arc;
 
 /// One thing that reached the service.
@@ -392,12 +391,11 @@ impl Pipeline {
 
     /// The tracker may ask where the vehicle was at other moments: the clock error is one of its states.
     fn track(&mut self, view: &View<'_>, sightings: &[Classified]) -> Vec<Outcome> {
-        let (now, poses) = (self.now, RefCell::new(&mut self.poses));
-        let motion =
-            |later_s: f64| match poses.borrow_mut().at(view.pose.at + seconds(later_s), now) {
-                PoseAnswer::Fresh(pose) => Some(*pose),
-                _ => None,
-            };
+        let (now, poses) = (self.now, &self.poses);
+        let motion = |later_s: f64| match poses.at(view.pose.at + seconds(later_s), now) {
+            PoseAnswer::Fresh(pose) => Some(*pose),
+            _ => None,
+        };
         let view = view.clone().with_motion(&motion);
         self.tracker.step(&view, sightings, self.terrain.as_deref())
     }
