@@ -4,8 +4,10 @@
 //! latitude, ellipsoid height). The position is the base of the fire: where the burning thing
 //! stands, beneath the flame's centre. Pure: no I/O, no clock.
 
+mod burning;
 mod desk;
 
+pub use burning::{Area, Burning, TrendProbability};
 pub use desk::{AlarmDesk, LEAST_S, REPEAT_S, Situation};
 
 use emberfix_frames::{Covariance, EllipsoidHeight, MissionEnu, ServiceTime, Wgs84, Wgs84Parts};
@@ -116,6 +118,9 @@ pub struct AlarmProperties {
     pub size_m: Option<SizeM>,
     /// How the fire changes (slope of its relative size, per second), if known.
     pub trend: Option<f64>,
+    /// How it burns.
+    #[serde(flatten)]
+    pub burning: Burning,
     /// Reasons why the ellipse is wider than it could be; empty when all is well.
     pub degraded: Vec<String>,
 }

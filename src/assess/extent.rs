@@ -57,6 +57,8 @@ pub struct Extent {
     pub width_m: Measured,
     /// Of the flames, upwards, metres.
     pub height_m: Measured,
+    /// Level of the ground there, up in the mission plane, metres.
+    pub level_m: f64,
     /// Corners of the burning ground, east and north in the mission plane, anticlockwise.
     pub polygon_m: Vec<Vector2<f64>>,
     /// One sigma of the polygon's edge, metres, without the error of the fire's position.
@@ -122,6 +124,7 @@ const PLACE_PRIOR: f64 = 50.0;
 #[derive(Debug, Clone, Default)]
 pub struct Outline {
     looks: VecDeque<Look>,
+    asked: Option<ServiceTime>,
 }
 
 /// The fire's near edge and what is known of its range.
@@ -131,9 +134,23 @@ pub struct Standing {
     pub foot: Vector3<f64>,
     /// One sigma of the range, as a share of it.
     pub range_share: f64,
+    /// How far the reported camera wanders against the ground, across and upwards, metres per square
+    /// root of a second: it makes a fire seem to move.
+    pub wander_m: (f64, f64),
 }
 
 impl Outline {
+    /// Whether `every_s` have passed since the last time that this was true.
+    pub fn is_due(&mut self, at: ServiceTime, every_s: f64) -> bool {
+        let due = self
+            .asked
+            .is_none_or(|last| (at - last).as_secs_f64() >= every_s);
+        if due {
+            self.asked = Some(at);
+        }
+        due
+    }
+
     /// Takes one look in.
     pub fn add(&mut self, look: Look) {
         let last = self.looks.back();
@@ -467,6 +484,7 @@ impl Shape {
                 value: area.value,
                 sigma: area.sigma.hypot(area.value * relative.min(1.0)),
             },
+            level_m: standing.foot.z,
             polygon_m,
             edge_sigma_m,
             front: if spread.is_some() { front } else { Vec::new() },

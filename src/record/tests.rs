@@ -38,6 +38,7 @@ fn alarm(ms: i64) -> Alarm {
             range_m: 17.2,
             size_m: None,
             trend: Some(0.01),
+            burning: Default::default(),
             degraded: vec!["one_eye".to_owned()],
         },
     }

@@ -383,6 +383,10 @@ impl<'a> Watch<'a> {
         Some(Standing {
             foot: placed + self.gnss_off(t_s),
             range_share: RANGE_SHARE,
+            wander_m: (
+                GNSS_M.0 * (2.0 / GNSS_S).sqrt(),
+                GNSS_M.1 * (2.0 / GNSS_S).sqrt(),
+            ),
         })
     }
 
