@@ -12,6 +12,7 @@
 
 pub mod extent;
 pub mod fusion;
+pub mod height;
 pub mod outline;
 pub mod printed;
 pub mod spectrum;
