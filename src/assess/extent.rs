@@ -112,15 +112,15 @@ const LEAST_OVAL_DEG: f64 = 30.0;
 const WIDTH_S: f64 = 10.0;
 const HEIGHT_S: f64 = 12.0;
 /// How far a box's side differs from its flame's for as long as we look: a detector's habits, glow.
-const BOX_SIGMA: f64 = 0.065;
+const BOX_SIGMA: f64 = 0.06;
 /// Depth of a fire against its width when it was seen from one side only, and one sigma of that share.
 const DEPTH: f64 = 1.0;
 const DEPTH_SIGMA: f64 = 0.4;
 /// Spread is told from this many sigmas of its speed, and below this sigma of its direction.
-const SURE: f64 = 2.5;
+const SURE: f64 = 3.0;
 const SURE_DEG: f64 = 20.0;
 /// Share of the speed, and degrees, that the oval itself is wrong by: fires are no ellipses.
-const SPEED_SHARE: f64 = 0.08;
+const SPEED_SHARE: f64 = 0.15;
 const DIRECTION_DEG: f64 = 2.0;
 /// Prior of the rate A, m/s; it and the size are otherwise as likely in each octave.
 const RATE_PRIOR: f64 = 3.0;

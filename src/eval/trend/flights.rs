@@ -6,7 +6,8 @@
 //! **Poses** are reported with errors that wander. **The tracker** is stood in for by the fire's
 //! near edge with one range error per flight, drawn from the share that the assessment is told.
 //! True width and height are how far the visible flames reach, to both sides of the line of sight
-//! and upwards. Half of the fires run over the ground, the others grow where they are.
+//! and upwards. Two fires in three run over the ground, the others grow or shrink where they are; three
+//! flights in four circle the fire, the others stay on one side of it.
 
 use crate::assess::extent::{Extent, Outline, Standing, Wind};
 use crate::assess::outline::Look;
@@ -153,7 +154,7 @@ impl Scene {
         let range_m = 10.0 * 10_f64.powf(draw(0.0, 1.0));
         let width_m = (range_m * draw(0.02, 0.06)).max(0.3);
         let height_m = width_m * draw(0.8, 1.6);
-        let runs = flight % 2 == 0;
+        let runs = flight % 3 != 0;
         let azimuth_deg = draw(0.0, 360.0);
         let speed_m_s = range_m / FLIGHT_S * draw(0.08, 0.3);
         let wind_m_s = draw(0.5, 5.0);
@@ -195,8 +196,13 @@ impl Scene {
             },
             ..WorldConfig::default()
         };
-        let circles = flight % 4 < 2;
-        let turn = draw(-1.0, 1.0) * if circles { 0.12 } else { 0.01 };
+        let side = if draw(0.0, 1.0) < 0.5 { 1.0 } else { -1.0 };
+        let turn = side
+            * if flight % 4 == 0 {
+                draw(0.0, 0.01)
+            } else {
+                draw(0.03, 0.12)
+            };
         let (depression, start) = (draw(20.0, 45.0), draw(0.0, 360.0));
         let knows_wind = draw(0.0, 1.0) < 0.5;
         let wind_error = Vector2::new(draw(-1.0, 1.0), draw(-1.0, 1.0));
