@@ -39,9 +39,9 @@ impl Dictionary {
     }
 
     fn all() -> impl Iterator<Item = Self> {
-        SIDES
-            .into_iter()
-            .flat_map(|side| SIZES.into_iter().map(move |markers| Self { side, markers }))
+        SIDES.into_iter().flat_map(|side| {
+            SIZES.into_iter().map(move |markers| Self { side, markers })
+        })
     }
 
     fn name(self) -> String {
@@ -80,8 +80,7 @@ impl Dictionary {
     /// The cells after a quarter turn anticlockwise.
     fn quarter_turn(self, cells: u64) -> u64 {
         let side = self.side;
-        let bit =
-            |row: usize, column: usize| (cells >> (side * side - 1 - row * side - column)) & 1;
+        let bit = |row: usize, column: usize| (cells >> (side * side - 1 - row * side - column)) & 1;
         let mut turned = 0;
         for row in 0..side {
             for column in 0..side {

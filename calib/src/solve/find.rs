@@ -3,7 +3,9 @@
 use super::{Board, BoardKind, Corner, View, charuco};
 use crate::RawPixel;
 use emberfix_frames::Vector2;
-use opencv::core::{Mat, MatTraitConst, Point2f, Size, TermCriteria, Vector};
+use opencv::core::{
+    Mat, MatTraitConst, Point2f, Size, TermCriteria, Vector,
+};
 use opencv::{Result, calib3d, imgcodecs, imgproc};
 
 /// The board's corners in a grey image (8 bit, one channel): all of a chessboard, any of a ChArUco
@@ -18,10 +20,11 @@ pub fn find_corners(image: &Mat, board: &Board) -> Result<Option<Vec<Corner>>> {
         return Ok(Some(corners));
     }
     let mut raised = Mat::default();
-    imgproc::create_clahe(4.0, Size::new(8, 8)).and_then(|mut clahe| {
-        use opencv::prelude::CLAHETrait;
-        clahe.apply(image, &mut raised)
-    })?;
+    imgproc::create_clahe(4.0, Size::new(8, 8))
+        .and_then(|mut clahe| {
+            use opencv::prelude::CLAHETrait;
+            clahe.apply(image, &mut raised)
+        })?;
     look(&raised, image, board)
 }
 

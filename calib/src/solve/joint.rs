@@ -249,7 +249,12 @@ fn damped<const N: usize>(matrix: SMatrix<f64, N, N>, damping: f64) -> SMatrix<f
     matrix
 }
 
-fn equations(state: &State, board: &Board, views: &[View], weights: Weights) -> Vec<ViewEquations> {
+fn equations(
+    state: &State,
+    board: &Board,
+    views: &[View],
+    weights: Weights,
+) -> Vec<ViewEquations> {
     let poses = state.boards.iter();
     poses
         .zip(views)
@@ -338,9 +343,7 @@ fn step(state: &State, equations: &[ViewEquations], damping: f64) -> Option<Stat
 
 /// The inverse of a positive matrix whose parameters differ in scale by many orders.
 fn scaled_inverse(matrix: &GlobalMatrix) -> Option<GlobalMatrix> {
-    let scale = matrix
-        .diagonal()
-        .map(|value| value.max(1e-300).sqrt().recip());
+    let scale = matrix.diagonal().map(|value| value.max(1e-300).sqrt().recip());
     let diagonal = GlobalMatrix::from_diagonal(&scale);
     let inverse = (diagonal * matrix * diagonal).cholesky()?.inverse();
     Some(diagonal * inverse * diagonal)
