@@ -195,6 +195,23 @@ impl World {
         Some(sum / f64::from(REACH_TIMES))
     }
 
+    /// Light of all flames from a place: face in m² times flicker over the squared range.
+    #[must_use]
+    pub fn flame_light(&self, from_m: &Vector3<f64>, t_s: f64) -> f64 {
+        let light = |fire: usize| {
+            let flame = self.flame(fire, t_s)?;
+            let truth = &self.fires[fire];
+            let age_s = t_s - truth.ignites_at_s;
+            let sites = truth.spread.map_or(1, |spread| {
+                spread.sites(flame.seed, flame.width_m, age_s).len()
+            });
+            let face_m2 = sites as f64 * flame.width_m * flame.height_m;
+            let range2_m2 = (flame.base_m - from_m).norm_squared().max(1.0);
+            Some(face_m2 * flame.flicker() * flame.temper() / range2_m2)
+        };
+        (0..self.fires.len()).filter_map(light).sum()
+    }
+
     pub(crate) fn terrain(&self) -> &Terrain {
         &self.terrain
     }
@@ -283,12 +300,13 @@ impl World {
         let splats = sites.iter().enumerate().flat_map(|(k, site)| {
             let foot = flame.base_m.xy() + site;
             Flame {
-                // A site is known by its place: it keeps its flame while others come and go.
-                seed: hash(
-                    flame.seed,
-                    (site.x * 64.0) as i32 as u32,
-                    (site.y * 64.0) as i32 as u32,
-                ) ^ u64::from(k == 0),
+                // A flame of the front goes with it, a site keeps its own while others come and go.
+                seed: if k < Spread::FRONT {
+                    hash(flame.seed, k as u32, 0xF07)
+                } else {
+                    let cell = [site.x, site.y].map(|metres| (metres * 64.0) as i32 as u32);
+                    hash(flame.seed, cell[0], cell[1])
+                },
                 base_m: Vector3::new(foot.x, foot.y, self.ground_up_m(foot.x, foot.y)),
                 ..flame
             }
