@@ -149,16 +149,17 @@ impl Look {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::locate::SharedSigmas;
+    use crate::locate::SharedPriors;
     use crate::testing::{datum, pose, rig};
     use emberfix_frames::ServiceTime;
 
     /// A fire 20 m ahead and 10 m below, 4 m wide, box 3 m high.
     fn look() -> (Look, Vector3<f64>) {
         let (rig, pose) = (rig(0.0), pose(0.0, 0.0, 0.0));
-        let sigmas = SharedSigmas {
+        let sigmas = SharedPriors {
             heading_rad: 0.0,
             tilt_rad: 0.0,
+            ..SharedPriors::default()
         };
         let view = View::new(&rig, &pose, &sigmas, &datum());
         let foot = view.camera_enu + Vector3::new(0.0, 20.0, -10.0);

@@ -6,6 +6,8 @@
 //! measured is the code that flies, through its public interface. This is the only room that sees the
 //! simulator; nothing that flies depends on this room.
 
+pub mod location;
+pub mod range;
 pub mod trend;
 
 use emberfix_report::{Figure, PlotError, Sheet};

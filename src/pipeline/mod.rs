@@ -22,15 +22,15 @@ use crate::assess::extent::{Extent, Wind};
 use crate::assess::watch::{Assessment, Assessor, Light};
 use crate::detect::{Detection, Detector};
 use crate::ingest::StereoPair;
-use crate::locate::{SharedSigmas, Terrain, View};
+use crate::locate::{Ground, SharedPriors, Terrain, View, fix};
 use crate::mission::Mission;
 use crate::pose::{Pose, PoseAnswer, PoseEstimator};
 use crate::range::Ranger;
-use crate::track::{Fire, Outcome, Tracker};
+use crate::track::{Classified, Fire, Outcome, Tracker};
 use emberfix_calib::Rig;
 use emberfix_frames::{
-    Coordinate, Metres, MissionEnu, ServiceTime, SignedDuration, Stamped, TimeSyncSample, Vector3,
-    Wgs84, Wgs84Parts, ecef_from_enu, place_from_ecef, seconds,
+    Coordinate, GeoidUndulation, Metres, MissionEnu, ServiceTime, SignedDuration, Stamped,
+    TimeSyncSample, Vector3, Wgs84, Wgs84Parts, ecef_from_enu, place_from_ecef, seconds,
 };
 use emberfix_mav::telemetry::{GpsRaw, TimeSyncMessage, WindEstimate};
 use emberfix_mav::{Address, Received, SystemId, Telemetry};
@@ -80,7 +80,7 @@ pub struct Pipeline {
     rig: Arc<Rig>,
     datum: Wgs84,
     terrain: Option<Arc<dyn Terrain>>,
-    shared: SharedSigmas,
+    shared: SharedPriors,
     vision: Vision,
     poses: PoseEstimator,
     tracker: Tracker,
@@ -213,6 +213,14 @@ impl Pipeline {
         {
             self.autopilot.system = Some(received.system());
         }
+        if let Telemetry::GimbalDeviceAttitude(said) = telemetry
+            && self.autopilot.system == Some(received.system())
+        {
+            let taken = self.poses.add_gimbal(received.component(), self.now, said);
+            self.counters
+                .add("gimbal", if taken { "taken" } else { "refused" });
+            return;
+        }
         if !self.autopilot.is(received.frame.sender()) {
             self.counters.add("mavlink", "other_sender");
             return;
@@ -242,6 +250,17 @@ impl Pipeline {
             }
             Telemetry::GpsRaw(raw) => self.take_gnss(raw),
             Telemetry::Wind(wind) => self.take_wind(wind),
+            Telemetry::Gps2Raw(raw) => {
+                if let Some(separation) = separation(raw) {
+                    self.poses.add_second_separation(separation);
+                }
+                self.counters.add("telemetry", "second_gnss");
+            }
+            Telemetry::EstimatorStatus(status) => {
+                self.poses
+                    .add_vertical_validity(status.flags.vertical_position());
+                self.counters.add("telemetry", "estimator_status");
+            }
             Telemetry::SystemTime(time) if time.utc_is_absurd() => {
                 self.counters.add("mavlink_refused", "absurd_utc");
             }
@@ -250,12 +269,12 @@ impl Pipeline {
     }
 
     fn take_gnss(&mut self, raw: &GpsRaw) {
-        let separation = raw
-            .place
-            .and_then(|place| place.height.map(|height| height - place.altitude));
         let sigmas = (raw.horizontal_sigma_m, raw.vertical_sigma_m);
         self.poses
-            .add_gnss(self.now, raw.fix.is_3d(), sigmas, separation);
+            .add_gnss(self.now, raw.fix.is_3d(), sigmas, separation(raw));
+        if let Some(place) = raw.place {
+            self.poses.add_gnss_altitude(self.now, place.altitude);
+        }
         self.counters.add(
             "telemetry",
             if raw.fix.is_3d() {
@@ -302,6 +321,11 @@ impl Pipeline {
             return Vec::new();
         };
         let moment = pair.at + seconds(self.rig.time_offset_s());
+        let last_needed = moment + seconds(self.tracker.looks_ahead_s());
+        if self.poses.at(last_needed, self.now) == PoseAnswer::NotYet {
+            self.waiting = Some(pair);
+            return Vec::new();
+        }
         match self.poses.at(moment, self.now) {
             PoseAnswer::NotYet => {
                 self.waiting = Some(pair);
@@ -320,6 +344,21 @@ impl Pipeline {
                 limit,
             } => self.without_pose("pose_stale", || {
                 format!("{what} is {nearest:#} away from the shutter, limit {limit:#}")
+            }),
+            PoseAnswer::Conflict {
+                what,
+                apart_deg,
+                limit_deg,
+            } => self.without_pose("pose_conflict", || {
+                format!("{what} are {apart_deg:.0} degrees apart, limit {limit_deg:.0}")
+            }),
+            PoseAnswer::TooFast {
+                turned_deg,
+                limit_deg,
+            } => self.without_pose("too_fast_for_shutter", || {
+                format!(
+                    "the camera turned {turned_deg:.1} degrees within one readout, limit {limit_deg:.1}"
+                )
             }),
             PoseAnswer::NoGnssFix => self.without_pose("no_gnss_fix", || {
                 "GNSS has no 3D fix: no positions".to_owned()
@@ -344,13 +383,12 @@ impl Pipeline {
         if seen.mono {
             self.degraded.push(crate::pose::Degraded::Mono.name());
         }
-        let terrain = self.terrain.clone();
         let sightings: Vec<_> = seen
             .sightings
             .iter()
             .map(|(_, sighting)| *sighting)
             .collect();
-        let outcomes = self.tracker.step(&view, &sightings, terrain.as_deref());
+        let outcomes = self.track(&view, &sightings);
         self.assess(pair, &seen, &outcomes, &view);
         let mut outputs = vec![Output::Pose(Box::new(pose.clone()))];
         for outcome in &outcomes {
@@ -431,20 +469,30 @@ impl Pipeline {
         usable.then(|| lights.iter().sum::<f64>() / lights.len() as f64)
     }
 
+    /// The tracker may ask where the vehicle was at other moments: the clock error is one of its states.
+    fn track(&mut self, view: &View<'_>, sightings: &[Classified]) -> Vec<Outcome> {
+        let (now, poses) = (self.now, &self.poses);
+        let motion = |later_s: f64| match poses.at(view.pose.at + seconds(later_s), now) {
+            PoseAnswer::Fresh(pose) => Some(*pose),
+            _ => None,
+        };
+        let view = view.clone().with_motion(&motion);
+        self.tracker.step(&view, sightings, self.terrain.as_deref())
+    }
+
     fn fix_output(&mut self, seen: &Seen, outcome: &Outcome, view: &View<'_>) -> Output {
         let (found, classified) = &seen.sightings[outcome.index];
         let at = classified.sighting.at;
-        let situation = outcome.fix.as_ref().map(|fix| {
+        let fix = fix(&classified.sighting, view, self.terrain.as_deref());
+        let situation = fix.as_ref().map(|fix| {
             let mut situation = situate(&fix.place, &self.poses, self.terrain.as_deref());
-            situation.degraded = self
-                .degraded
-                .iter()
-                .map(|reason| (*reason).to_owned())
-                .collect();
+            let reasons = self.degraded.iter().map(|reason| (*reason).to_owned());
+            situation.degraded.extend(reasons);
             situation
         });
         let box_px = seen.found[*found].box_px;
-        let feature = feature::sighting(classified, outcome, box_px, situation.as_ref(), view);
+        let placed = fix.as_ref().zip(situation.as_ref());
+        let feature = feature::sighting(classified, box_px, placed, view);
         Output::Fix {
             at,
             feature: self.desk.signed(outcome.fire, feature),
@@ -458,7 +506,8 @@ impl Pipeline {
         let due = self.desk.due(self.tracker.fires(), |fire| {
             let place = place_from_ecef(&ecef_from_enu(&datum).transform(fire.position()))?;
             let mut situation = situate(&place, poses, terrain.as_deref());
-            situation.degraded = degraded.iter().map(|reason| (*reason).to_owned()).collect();
+            let reasons = degraded.iter().map(|reason| (*reason).to_owned());
+            situation.degraded.extend(reasons);
             situation.degraded.extend(
                 fire.merged_into
                     .map(|into| format!("merged_into_{}", into.0)),
@@ -487,16 +536,27 @@ impl AutopilotLock {
     }
 }
 
+/// Ellipsoid height minus altitude, where a receiver gives both.
+fn separation(raw: &GpsRaw) -> Option<GeoidUndulation> {
+    raw.place
+        .and_then(|place| place.height.map(|height| height - place.altitude))
+}
+
 /// Altitude and height above ground of a place.
 fn situate(place: &Wgs84, poses: &PoseEstimator, terrain: Option<&dyn Terrain>) -> Situation {
-    let ground = terrain.and_then(|terrain| terrain.height_at(place));
+    let (ground, degraded) = match terrain.map(|terrain| terrain.ground_at(place)) {
+        None => (None, None),
+        Some(Ground::Known { height, .. }) => (Some(height), None),
+        Some(Ground::Void) => (None, Some("terrain_void")),
+        Some(Ground::OffTiles) => (None, Some("terrain_off_tiles")),
+    };
     Situation {
         place: *place,
         altitude: place.height() - poses.undulation(place),
         above_ground: ground.map(|ground| place.height() - ground),
         assessment: Assessment::default(),
         area: None,
-        degraded: Vec::new(),
+        degraded: degraded.into_iter().map(str::to_owned).collect(),
     }
 }
 

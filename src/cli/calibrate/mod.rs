@@ -3,6 +3,9 @@
 mod boresight;
 mod export;
 mod import;
+mod live;
+mod mounting;
+mod pairs;
 mod range;
 mod stereo;
 

@@ -11,7 +11,7 @@
 
 use crate::assess::extent::{Extent, Outline, Standing, Wind};
 use crate::assess::outline::Look;
-use crate::locate::{SharedSigmas, Sighting, View};
+use crate::locate::{SharedPriors, Sighting, View};
 use crate::pose::Pose;
 use emberfix_calib::{Eye, RawPixel, RectifiedPixel, Rig};
 use emberfix_frames::{
@@ -299,9 +299,10 @@ impl<'a> Watch<'a> {
         let Some(pose) = self.pose(body, t_s) else {
             return;
         };
-        let sigmas = SharedSigmas {
+        let sigmas = SharedPriors {
             heading_rad: HEADING_RAD,
             tilt_rad: TILT_RAD,
+            ..SharedPriors::default()
         };
         let view = View::new(self.rig, &pose, &sigmas, &self.datum);
         self.outline.add(Look::of(&sighting, &view));
