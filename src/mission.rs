@@ -4,7 +4,7 @@
 //! mission file. The `[sim]` table belongs to the simulator and is not read here.
 
 use crate::detect::{DetectorConfig, Family};
-use crate::locate::{SharedSigmas, Terrain};
+use crate::locate::{SharedPriors, Terrain};
 use crate::pose::PoseConfig;
 use crate::range::{HsvMask, Method, RangeConfig};
 use crate::track::TrackConfig;
@@ -14,6 +14,7 @@ use serde::Deserialize;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+mod gimbal;
 mod terrain;
 
 /// Why a mission file was refused.
@@ -83,8 +84,8 @@ pub struct Mission {
     pub terrain: Option<Arc<dyn Terrain>>,
     /// Defaults and limits of the pose.
     pub pose: PoseConfig,
-    /// Errors that stay the same from frame to frame.
-    pub shared: SharedSigmas,
+    /// What is known beforehand of the errors that all sightings share.
+    pub shared: SharedPriors,
     /// The tracker.
     pub track: TrackConfig,
     /// The ground agent.
@@ -116,6 +117,7 @@ struct RawMission {
     #[serde(default)]
     range: RawRange,
     terrain: Option<terrain::RawTerrain>,
+    gimbal: Option<gimbal::RawGimbal>,
     #[serde(default)]
     sigma: RawSigma,
     #[serde(default)]
@@ -173,21 +175,29 @@ struct RawSigma {
     gnss_floor_m: f64,
     heading_deg: f64,
     tilt_deg: f64,
+    gnss_constant_share: f64,
     gnss_correlation_s: f64,
+    heading_constant_share: f64,
     heading_correlation_s: f64,
+    tilt_constant_share: f64,
+    tilt_correlation_s: f64,
 }
 
 impl Default for RawSigma {
     fn default() -> Self {
-        let (pose, track) = (PoseConfig::default(), TrackConfig::default());
+        let (pose, shared) = (PoseConfig::default(), SharedPriors::default());
         Self {
             gnss_horizontal_m: pose.gnss_horizontal_m,
             gnss_vertical_m: pose.gnss_vertical_m,
             gnss_floor_m: pose.gnss_floor_m,
-            heading_deg: 2.0,
-            tilt_deg: 0.5,
-            gnss_correlation_s: track.gnss_correlation_s,
-            heading_correlation_s: track.heading_correlation_s,
+            heading_deg: shared.heading_rad.to_degrees(),
+            tilt_deg: shared.tilt_rad.to_degrees(),
+            gnss_constant_share: shared.gnss_constant_share,
+            gnss_correlation_s: shared.gnss_correlation_s,
+            heading_constant_share: shared.heading_constant_share,
+            heading_correlation_s: shared.heading_correlation_s,
+            tilt_constant_share: shared.tilt_constant_share,
+            tilt_correlation_s: shared.tilt_correlation_s,
         }
     }
 }
@@ -264,13 +274,21 @@ const KNOWN: &[&str] = &[
     "terrain.horizontal_sigma_m",
     "terrain.canopy_m",
     "terrain.reach_m",
+    "gimbal.pivot_m",
+    "gimbal.component_id",
+    "gimbal.device_id",
+    "gimbal.sigma_deg",
     "sigma.gnss_horizontal_m",
     "sigma.gnss_vertical_m",
     "sigma.gnss_floor_m",
     "sigma.heading_deg",
     "sigma.tilt_deg",
+    "sigma.gnss_constant_share",
     "sigma.gnss_correlation_s",
+    "sigma.heading_constant_share",
     "sigma.heading_correlation_s",
+    "sigma.tilt_constant_share",
+    "sigma.tilt_correlation_s",
     "track.confirm_sightings",
     "track.confirm_span_s",
     "track.forget_suspected_s",
@@ -364,6 +382,9 @@ fn check(raw: &RawMission) -> Vec<String> {
     if let Some(terrain) = &raw.terrain {
         terrain.check(&mut checks);
     }
+    if let Some(gimbal) = &raw.gimbal {
+        gimbal.check(&mut checks);
+    }
     check_sigma(&mut checks, &raw.sigma);
     checks.range(
         "track.confirm_sightings",
@@ -428,20 +449,20 @@ fn check_sigma(checks: &mut Checks, sigma: &RawSigma) {
         " (degrees)",
     );
     checks.range("sigma.tilt_deg", sigma.tilt_deg, 0.01, 45.0, " (degrees)");
-    checks.range(
-        "sigma.gnss_correlation_s",
-        sigma.gnss_correlation_s,
-        1.0,
-        1e6,
-        "",
-    );
-    checks.range(
-        "sigma.heading_correlation_s",
-        sigma.heading_correlation_s,
-        1.0,
-        1e6,
-        "",
-    );
+    for (key, share) in [
+        ("sigma.gnss_constant_share", sigma.gnss_constant_share),
+        ("sigma.heading_constant_share", sigma.heading_constant_share),
+        ("sigma.tilt_constant_share", sigma.tilt_constant_share),
+    ] {
+        checks.range(key, share, 0.0, 1.0, " (of the variance)");
+    }
+    for (key, seconds) in [
+        ("sigma.gnss_correlation_s", sigma.gnss_correlation_s),
+        ("sigma.heading_correlation_s", sigma.heading_correlation_s),
+        ("sigma.tilt_correlation_s", sigma.tilt_correlation_s),
+    ] {
+        checks.range(key, seconds, 1.0, 1e6, "");
+    }
 }
 
 fn build(raw: RawMission, path: &Path) -> Result<Mission, MissionError> {
@@ -481,18 +502,27 @@ fn build(raw: RawMission, path: &Path) -> Result<Mission, MissionError> {
             gnss_horizontal_m: raw.sigma.gnss_horizontal_m,
             gnss_vertical_m: raw.sigma.gnss_vertical_m,
             gnss_floor_m: raw.sigma.gnss_floor_m,
+            rolling_readout_s: rig.rolling_readout_s(),
+            gimbal: raw.gimbal.as_ref().map(gimbal::RawGimbal::build),
             ..PoseConfig::default()
         },
-        shared: SharedSigmas {
+        shared: SharedPriors {
+            gnss_constant_share: raw.sigma.gnss_constant_share,
+            gnss_correlation_s: raw.sigma.gnss_correlation_s,
             heading_rad: raw.sigma.heading_deg.to_radians(),
-            tilt_rad: raw.sigma.tilt_deg.to_radians(),
+            heading_constant_share: raw.sigma.heading_constant_share,
+            heading_correlation_s: raw.sigma.heading_correlation_s,
+            tilt_rad: (raw.sigma.tilt_deg.to_radians()).hypot(
+                raw.gimbal
+                    .as_ref()
+                    .map_or(0.0, gimbal::RawGimbal::sigma_rad),
+            ),
+            tilt_constant_share: raw.sigma.tilt_constant_share,
+            tilt_correlation_s: raw.sigma.tilt_correlation_s,
         },
         track: TrackConfig {
             confirm_sightings: raw.track.confirm_sightings,
             confirm_span_s: raw.track.confirm_span_s,
-            gnss_correlation_s: raw.sigma.gnss_correlation_s,
-            heading_correlation_s: raw.sigma.heading_correlation_s,
-            mount_correlation_s: TrackConfig::default().mount_correlation_s,
             forget_suspected_s: raw.track.forget_suspected_s,
         },
         ground: GroundLinks {

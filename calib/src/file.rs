@@ -1,7 +1,9 @@
 //! The rig file: raw TOML to a checked [`Rig`], every problem at once.
 
+use crate::inverse_depth::{OFFSETS_PER_M, SCALES};
 use crate::{
-    Camera, Checks, Eye, KeyProblem, Rectification, Rig, RigSigmas, toml_problem, unknown_keys,
+    Calibrated, Camera, Checks, Finding, InverseDepth, KeyProblem, Rectification, Rig, RigSigmas,
+    Severity, implausible, toml_problem, unknown_keys,
 };
 use emberfix_frames::{Metres, MountAngles, Vector, Vector3};
 use serde::Deserialize;
@@ -53,6 +55,9 @@ struct RawRig {
     mount: RawMount,
     time: RawTime,
     sigma: RawSigma,
+    #[serde(default)]
+    inverse_depth: RawInverseDepth,
+    calibrated: Option<RawCalibrated>,
 }
 
 #[derive(Deserialize)]
@@ -81,6 +86,8 @@ struct RawMount {
 #[derive(Deserialize)]
 struct RawTime {
     camera_offset_s: f64,
+    #[serde(default)]
+    rolling_readout_s: f64,
 }
 
 #[derive(Deserialize)]
@@ -89,6 +96,34 @@ struct RawSigma {
     boresight_deg: f64,
     lever_arm_m: f64,
     time_offset_s: f64,
+}
+
+#[derive(Deserialize)]
+#[serde(default)]
+struct RawInverseDepth {
+    scale: f64,
+    offset_per_m: f64,
+    covariance: [f64; 3],
+}
+
+impl Default for RawInverseDepth {
+    fn default() -> Self {
+        let plain = InverseDepth::default();
+        Self {
+            scale: plain.scale,
+            offset_per_m: plain.offset_per_m,
+            covariance: plain.covariance,
+        }
+    }
+}
+
+#[derive(Deserialize)]
+struct RawCalibrated {
+    at: String,
+    pairs: usize,
+    rms_px: f64,
+    held_out_rms_px: f64,
+    range_sigma_at_10m_percent: f64,
 }
 
 const KNOWN: &[&str] = &[
@@ -109,10 +144,19 @@ const KNOWN: &[&str] = &[
     "mount.roll_deg",
     "mount.lever_arm_m",
     "time.camera_offset_s",
+    "time.rolling_readout_s",
     "sigma.disparity_bias_px",
     "sigma.boresight_deg",
     "sigma.lever_arm_m",
     "sigma.time_offset_s",
+    "inverse_depth.scale",
+    "inverse_depth.offset_per_m",
+    "inverse_depth.covariance",
+    "calibrated.at",
+    "calibrated.pairs",
+    "calibrated.rms_px",
+    "calibrated.held_out_rms_px",
+    "calibrated.range_sigma_at_10m_percent",
 ];
 
 pub(crate) fn load(path: &Path) -> Result<Rig, RigError> {
@@ -179,6 +223,13 @@ fn check(raw: &RawRig) -> Vec<String> {
         2.0,
         " (seconds)",
     );
+    checks.range(
+        "time.rolling_readout_s",
+        raw.time.rolling_readout_s,
+        0.0,
+        0.2,
+        " (0 is a global shutter)",
+    );
     let sigma = &raw.sigma;
     checks.range(
         "sigma.disparity_bias_px",
@@ -190,7 +241,25 @@ fn check(raw: &RawRig) -> Vec<String> {
     checks.range("sigma.boresight_deg", sigma.boresight_deg, 0.0, 45.0, "");
     checks.range("sigma.lever_arm_m", sigma.lever_arm_m, 0.0, 5.0, "");
     checks.range("sigma.time_offset_s", sigma.time_offset_s, 0.0, 2.0, "");
+    check_inverse_depth(&mut checks, &raw.inverse_depth);
     checks.into_problems()
+}
+
+fn check_inverse_depth(checks: &mut Checks, raw: &RawInverseDepth) {
+    let (scales, offsets) = (SCALES, OFFSETS_PER_M);
+    checks.range("inverse_depth.scale", raw.scale, scales.0, scales.1, "");
+    checks.range(
+        "inverse_depth.offset_per_m",
+        raw.offset_per_m,
+        offsets.0,
+        offsets.1,
+        "",
+    );
+    let [scale, both, offset] = raw.covariance;
+    checks.range("inverse_depth.covariance[0]", scale, 0.0, 1.0, "");
+    checks.range("inverse_depth.covariance[2]", offset, 0.0, 1.0, "");
+    let most = (scale * offset).max(0.0).sqrt() * (1.0 + 1e-2);
+    checks.range("inverse_depth.covariance[1]", both, -most, most, "");
 }
 
 fn check_camera(checks: &mut Checks, eye: &str, camera: &RawCamera) {
@@ -309,13 +378,15 @@ fn build(raw: RawRig, path: &Path) -> Result<Rig, RigError> {
             path: path.to_owned(),
             source,
         })?;
-    let turned_deg = rectification.turn_rad(Eye::Left).to_degrees();
-    if turned_deg > MAX_TURN_DEG {
-        let problem = format!(
-            "rectification turns the left eye by {turned_deg:.1} degrees, allowed is {MAX_TURN_DEG}; \
-             calibrate again: a rig whose eyes look along parallel axes needs less than one"
-        );
-        return Err(values(path, vec![problem]));
+    let findings = implausible(&left, &right, &rectification, &translation_m);
+    if findings
+        .iter()
+        .any(|found| found.severity == Severity::Refusal)
+    {
+        return Err(values(
+            path,
+            findings.iter().map(Finding::to_string).collect(),
+        ));
     }
     Ok(Rig {
         name: raw.name,
@@ -330,6 +401,7 @@ fn build(raw: RawRig, path: &Path) -> Result<Rig, RigError> {
         },
         lever_arm: Vector::from_metres(Vector3::from(raw.mount.lever_arm_m)),
         time_offset_s: raw.time.camera_offset_s,
+        rolling_readout_s: raw.time.rolling_readout_s,
         max_skew_s: raw.stereo.max_skew_s,
         sigmas: RigSigmas {
             disparity_bias_px: raw.sigma.disparity_bias_px,
@@ -337,12 +409,26 @@ fn build(raw: RawRig, path: &Path) -> Result<Rig, RigError> {
             lever_arm_m: raw.sigma.lever_arm_m,
             time_offset_s: raw.sigma.time_offset_s,
         },
+        inverse_depth: InverseDepth {
+            scale: raw.inverse_depth.scale,
+            offset_per_m: raw.inverse_depth.offset_per_m,
+            covariance: raw.inverse_depth.covariance,
+        },
         rectification,
+        calibrated: raw.calibrated.map(calibrated),
+        doubts: findings,
     })
 }
 
-/// Beyond this a rig is bent or its calibration wrong (P4's printed rig turns by 6.9 degrees).
-const MAX_TURN_DEG: f64 = 3.0;
+fn calibrated(raw: RawCalibrated) -> Calibrated {
+    Calibrated {
+        at: raw.at,
+        pairs: raw.pairs,
+        rms_px: raw.rms_px,
+        held_out_rms_px: raw.held_out_rms_px,
+        range_sigma_at_10m_percent: raw.range_sigma_at_10m_percent,
+    }
+}
 
 fn camera(raw: &RawCamera) -> Camera {
     let [width, height] = raw.image_size_px;

@@ -5,17 +5,27 @@
 //! **Out:** pixels to rectified pixels, rectified pixels to rays, camera to body.
 //!
 //! **Assumptions.** Pinhole cameras with OpenCV's five-term distortion (k1 k2 p1 p2 k3), pixel
-//! centres at whole numbers. **Known limits.** No fisheye, no rolling-shutter model.
+//! centres at whole numbers. **Known limits.** No fisheye; a rolling shutter has a time
+//! but no model.
 
+pub mod exchange;
 mod file;
+mod inverse_depth;
 mod nearest;
+mod page;
+mod parts;
+mod plausible;
 mod rectify;
 pub mod solve;
 #[cfg(test)]
 mod tests;
 
 pub use file::RigError;
+pub use inverse_depth::{InverseDepth, InverseDepthError, Reading};
 pub use nearest::{Checks, KeyProblem, nearest_key, toml_problem, unknown_keys};
+pub use page::{PageInput, page};
+pub use parts::{Calibrated, Mounting, RigParts, mount_angles};
+pub use plausible::{Finding, MAX_K3, MAX_TURN_DEG, Severity, implausible};
 pub use rectify::Rectification;
 
 use emberfix_frames::{
@@ -89,9 +99,13 @@ pub struct Rig {
     mount: MountAngles,
     lever_arm: Vector<BodyFrd>,
     time_offset_s: f64,
+    rolling_readout_s: f64,
     max_skew_s: f64,
     sigmas: RigSigmas,
+    inverse_depth: InverseDepth,
     rectification: Rectification,
+    calibrated: Option<Calibrated>,
+    doubts: Vec<Finding>,
 }
 
 impl Rig {
@@ -101,6 +115,14 @@ impl Rig {
     /// [`RigError`] that names the file and every problem in it.
     pub fn load(path: &std::path::Path) -> Result<Self, RigError> {
         file::load(path)
+    }
+
+    /// Checks the text of a rig file; `origin` is what errors call it.
+    ///
+    /// # Errors
+    /// [`RigError`] that names the origin and every problem in it.
+    pub fn parse(text: &str, origin: &std::path::Path) -> Result<Self, RigError> {
+        file::parse(text, origin)
     }
 
     /// Name of the rig, for reports.
@@ -146,6 +168,11 @@ impl Rig {
     pub fn time_offset_s(&self) -> f64 {
         self.time_offset_s
     }
+    /// From the exposure of the first row to that of the last, seconds; 0 for a global shutter.
+    #[must_use]
+    pub fn rolling_readout_s(&self) -> f64 {
+        self.rolling_readout_s
+    }
     /// Greatest difference of the eyes' exposures that still counts as one moment, seconds.
     #[must_use]
     pub fn max_skew_s(&self) -> f64 {
@@ -155,6 +182,16 @@ impl Rig {
     #[must_use]
     pub fn sigmas(&self) -> &RigSigmas {
         &self.sigmas
+    }
+    /// What the calibration said of itself, if the file tells.
+    #[must_use]
+    pub fn calibrated(&self) -> Option<&Calibrated> {
+        self.calibrated.as_ref()
+    }
+    /// What is implausible, yet no reason to refuse the rig.
+    #[must_use]
+    pub fn doubts(&self) -> &[Finding] {
+        &self.doubts
     }
     /// The rectified pair's geometry and the way into it.
     #[must_use]
@@ -185,6 +222,35 @@ impl Rig {
     pub fn disparity_px(&self, depth_m: f64) -> f64 {
         let rect = &self.rectification;
         rect.focal_px() * self.baseline_m() / depth_m + rect.infinity_disparity_px()
+    }
+
+    /// What known distances said of this rig.
+    #[must_use]
+    pub fn inverse_depth(&self) -> &InverseDepth {
+        &self.inverse_depth
+    }
+
+    /// Disparity that stands for the true depth, from a measured one, both rectified pixels. Whoever
+    /// measures applies it once; [`Rig::depth_m`] expects it.
+    #[must_use]
+    pub fn corrected_disparity_px(&self, measured_px: f64) -> f64 {
+        let rect = &self.rectification;
+        let (focal_baseline, infinity) = (
+            rect.focal_px() * self.baseline_m(),
+            rect.infinity_disparity_px(),
+        );
+        let measured_per_m = (measured_px - infinity) / focal_baseline;
+        focal_baseline * self.inverse_depth.corrected_per_m(measured_per_m) + infinity
+    }
+
+    /// One sigma of the disparity offset that calibration leaves at a corrected disparity, pixels.
+    #[must_use]
+    pub fn disparity_bias_sigma_px(&self, corrected_px: f64) -> f64 {
+        let rect = &self.rectification;
+        let focal_baseline = rect.focal_px() * self.baseline_m();
+        let per_m = (corrected_px - rect.infinity_disparity_px()) / focal_baseline;
+        let left = focal_baseline * self.inverse_depth.sigma_per_m(per_m);
+        self.sigmas.disparity_bias_px.hypot(left)
     }
 
     /// Direction of a rectified left pixel: metres in [`CamLeft`] per metre of depth.

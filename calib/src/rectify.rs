@@ -64,6 +64,12 @@ impl Rectification {
         &self.rectified_from_raw[index(eye)]
     }
 
+    /// The left block of the rectified projection of an eye (OpenCV's P1, P2), pixels.
+    #[must_use]
+    pub fn projection(&self, eye: Eye) -> &Matrix3<f64> {
+        &self.projection[index(eye)]
+    }
+
     /// Focal length of the rectified pair, pixels.
     #[must_use]
     pub fn focal_px(&self) -> f64 {

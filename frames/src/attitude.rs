@@ -69,6 +69,12 @@ impl Attitude {
         }
     }
 
+    /// From a rotation that takes body (FRD) components to north, east, down components.
+    #[must_use]
+    pub fn from_unit_quaternion(ned_from_body: UnitQuaternion<f64>) -> Self {
+        Self { ned_from_body }
+    }
+
     /// Roll, pitch, heading in radians.
     #[must_use]
     pub fn angles(&self) -> (f64, f64, f64) {

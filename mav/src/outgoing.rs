@@ -891,4 +891,63 @@ mod tests {
             crate::telemetry::GimbalYaw::FromNose
         );
     }
+    #[test]
+    fn a_gimbal_with_both_yaw_frames_is_refused_and_its_locks_do_not_turn_its_frame() {
+        use dialect::GimbalDeviceErrorFlags as Faults;
+        use dialect::GimbalDeviceFlags as Flags;
+        let says = |flags, failure_flags, delta_yaw| {
+            let message = dialect::GIMBAL_DEVICE_ATTITUDE_STATUS_DATA {
+                q: [1.0, 0.0, 0.0, 0.0],
+                flags,
+                failure_flags,
+                delta_yaw,
+                gimbal_device_id: 2,
+                ..Default::default()
+            };
+            match through_the_wire(&MavMessage::GIMBAL_DEVICE_ATTITUDE_STATUS(message)) {
+                Ok(Telemetry::GimbalDeviceAttitude(gimbal)) => Ok(gimbal),
+                Ok(other) => panic!("{other:?}"),
+                Err(error) => Err(error.name()),
+            }
+        };
+        let vehicle = Flags::GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME;
+        let earth = Flags::GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME;
+        let locks = Flags::GIMBAL_DEVICE_FLAGS_ROLL_LOCK | Flags::GIMBAL_DEVICE_FLAGS_PITCH_LOCK;
+        let fine = Faults::empty();
+        assert_eq!(says(vehicle | earth, fine, 0.5), Err("two_yaw_frames"));
+        for flags in [vehicle, vehicle | locks] {
+            let gimbal = says(flags, fine, 0.5).unwrap();
+            assert_eq!(gimbal.yaw, crate::telemetry::GimbalYaw::FromNose);
+            assert_eq!((gimbal.nose_rad, gimbal.device), (Some(0.5), 2));
+        }
+        // Without a frame flag the field is not to be read; not-a-number is unknown.
+        assert_eq!(says(locks, fine, 0.5).unwrap().nose_rad, None);
+        assert_eq!(says(earth, fine, f32::NAN).unwrap().nose_rad, None);
+        let limit = Faults::GIMBAL_DEVICE_ERROR_FLAGS_AT_PITCH_LIMIT;
+        assert!(!says(earth, limit, 0.5).unwrap().is_faulty);
+        let encoder = Faults::GIMBAL_DEVICE_ERROR_FLAGS_ENCODER_ERROR;
+        assert!(says(earth, encoder, 0.5).unwrap().is_faulty);
+    }
+
+    #[test]
+    fn a_second_receiver_is_read_like_the_first() {
+        let message = dialect::GPS2_RAW_DATA {
+            fix_type: dialect::GpsFixType::GPS_FIX_TYPE_3D_FIX,
+            lat: 313_000_000,
+            lon: 1_190_000_000,
+            alt: 20_000,
+            alt_ellipsoid: 31_000,
+            h_acc: 900,
+            ..Default::default()
+        };
+        let Ok(Telemetry::Gps2Raw(gps)) = through_the_wire(&MavMessage::GPS2_RAW(message)) else {
+            panic!("not a second receiver");
+        };
+        let place = gps.place.unwrap();
+        assert_eq!(
+            place.height.unwrap() - place.altitude,
+            emberfix_frames::GeoidUndulation::from_m(11.0)
+        );
+        assert_eq!(gps.horizontal_sigma_m, Some(0.9));
+    }
 }

@@ -24,6 +24,8 @@ pub enum Telemetry {
     GlobalPosition(GlobalPosition),
     /// GPS_RAW_INT.
     GpsRaw(GpsRaw),
+    /// GPS2_RAW: a second receiver.
+    Gps2Raw(GpsRaw),
     /// SYSTEM_TIME.
     SystemTime(SystemTime),
     /// TIMESYNC.
@@ -46,6 +48,8 @@ pub enum Telemetry {
     CameraTrackingGeoStatus(CameraTrackingGeoStatus),
     /// RADIO_STATUS.
     RadioStatus(RadioStatus),
+    /// WIND_COV, where the autopilot knows the wind.
+    Wind(WindEstimate),
     /// Anything else.
     Other {
         /// Its id.
@@ -201,6 +205,15 @@ pub struct GpsRaw {
     pub satellites: Option<u8>,
 }
 
+/// Where the air goes, as the autopilot's estimator has it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct WindEstimate {
+    /// East, north, up, m/s: where it blows to.
+    pub towards_enu_m_s: Vector3<f64>,
+    /// One sigma per horizontal axis, m/s; `None` where it is not stated.
+    pub horizontal_sigma_m_s: Option<f64>,
+}
+
 /// The vehicle's two clocks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SystemTime {
@@ -303,14 +316,25 @@ pub enum GimbalYaw {
 }
 
 /// How a gimbal stands.
+///
+/// The flags that lock roll, pitch or yaw say what the gimbal holds still, not what its quaternion
+/// counts from: roll and pitch always count from the horizon. Only a message without either yaw
+/// frame flag says its yaw frame by its yaw lock.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GimbalDeviceAttitude {
-    /// When it held.
+    /// When it held, on the clock of whoever sent it.
     pub boot: BootTime,
-    /// Gimbal axes to level axes; roll and pitch from the horizon, yaw as `yaw` says.
+    /// Which of the gimbals that hang on the sender: 1 to 6; 0 is the sender itself.
+    pub device: u8,
+    /// Gimbal axes (forward, right, down) to level axes; roll and pitch from the horizon, yaw as
+    /// `yaw` says.
     pub quaternion: UnitQuaternion<f64>,
     /// What yaw counts from.
     pub yaw: GimbalYaw,
+    /// Vehicle's nose clockwise from north as the gimbal has it, radians, where it says so.
+    pub nose_rad: Option<f64>,
+    /// It reports an encoder, software or link fault, or calibrates: the attitude may be anything.
+    pub is_faulty: bool,
     /// Turn rates, rad/s, where known.
     pub rate_rad_s: Option<Vector3<f64>>,
 }
@@ -513,6 +537,12 @@ pub enum DecodeError {
         /// What stood there.
         value: f64,
     },
+    /// Yaw can't count from the nose and from north.
+    #[error("{message} sets both yaw frame flags, which is not allowed")]
+    TwoYawFrames {
+        /// Which message.
+        message: &'static str,
+    },
     /// No attitude.
     #[error("{message}: {source}")]
     Attitude {
@@ -534,6 +564,7 @@ impl DecodeError {
             Self::Longitude { .. } => "longitude",
             Self::Altitude { .. } => "altitude",
             Self::NotFinite { .. } => "not_finite",
+            Self::TwoYawFrames { .. } => "two_yaw_frames",
             Self::Attitude { .. } => "attitude",
         }
     }
@@ -568,6 +599,7 @@ fn translate(message: &MavMessage) -> Result<Telemetry, DecodeError> {
         MavMessage::ATTITUDE(m) => Telemetry::Attitude(attitude(m)?),
         MavMessage::GLOBAL_POSITION_INT(m) => Telemetry::GlobalPosition(global_position(m)?),
         MavMessage::GPS_RAW_INT(m) => Telemetry::GpsRaw(gps_raw(m)?),
+        MavMessage::GPS2_RAW(m) => Telemetry::Gps2Raw(gps2_raw(m)?),
         MavMessage::SYSTEM_TIME(m) => Telemetry::SystemTime(system_time(m)),
         MavMessage::TIMESYNC(m) => Telemetry::TimeSync(time_sync(m)),
         MavMessage::ESTIMATOR_STATUS(m) => Telemetry::EstimatorStatus(estimator_status(m)),
@@ -583,10 +615,23 @@ fn translate(message: &MavMessage) -> Result<Telemetry, DecodeError> {
             Telemetry::CameraTrackingGeoStatus(tracking_status(m)?)
         }
         MavMessage::RADIO_STATUS(m) => Telemetry::RadioStatus(radio_status(m)),
+        MavMessage::WIND_COV(m) if m.wind_x.is_finite() && m.wind_y.is_finite() => {
+            Telemetry::Wind(wind(m))
+        }
         other => Telemetry::Other {
             message_id: other.message_id(),
         },
     })
+}
+
+/// North and east on the wire are the air's own motion, so the wind blows towards them.
+fn wind(m: &dialect::WIND_COV_DATA) -> WindEstimate {
+    let up = if m.wind_z.is_finite() { -m.wind_z } else { 0.0 };
+    let variance = f64::from(m.var_horiz);
+    WindEstimate {
+        towards_enu_m_s: Vector3::new(f64::from(m.wind_y), f64::from(m.wind_x), f64::from(up)),
+        horizontal_sigma_m_s: (variance.is_finite() && variance > 0.0).then(|| variance.sqrt()),
+    }
 }
 
 fn heartbeat(m: &dialect::HEARTBEAT_DATA) -> Heartbeat {
@@ -649,40 +694,87 @@ fn global_position(m: &dialect::GLOBAL_POSITION_INT_DATA) -> Result<GlobalPositi
 }
 
 fn gps_raw(m: &dialect::GPS_RAW_INT_DATA) -> Result<GpsRaw, DecodeError> {
-    let fix = gnss_fix(m.fix_type);
-    Ok(GpsRaw {
-        time: vehicle_time(m.time_usec),
-        fix,
-        place: if fix.is_3d() {
-            Some(gnss_place(m)?)
-        } else {
-            None
-        },
-        horizontal_sigma_m: known_millimetres(m.h_acc),
-        vertical_sigma_m: known_millimetres(m.v_acc),
-        ground_speed_m_s: (m.vel != u16::MAX).then(|| f64::from(m.vel) * 0.01),
-        course_rad: (m.cog <= 36_000).then(|| centidegrees(m.cog)),
-        satellites: (m.satellites_visible != u8::MAX).then_some(m.satellites_visible),
-    })
+    WireGps {
+        message: "GPS_RAW_INT",
+        time_us: m.time_usec,
+        fix_type: m.fix_type,
+        place: (m.lat, m.lon),
+        alt_mm: m.alt,
+        alt_ellipsoid_mm: m.alt_ellipsoid,
+        accuracy_mm: (m.h_acc, m.v_acc),
+        speed_course: (m.vel, m.cog),
+        satellites: m.satellites_visible,
+    }
+    .read()
 }
 
-fn gnss_place(m: &dialect::GPS_RAW_INT_DATA) -> Result<GnssPlace, DecodeError> {
-    let wire = WirePlace {
-        message: "GPS_RAW_INT",
-        lat: m.lat,
-        lon: m.lon,
-    };
-    let (latitude_deg, longitude_deg) = wire.degrees()?;
-    let altitude = wire.altitude(millimetres(m.alt))?;
-    // An absent extension reads as 0, so that a receiver exactly on the ellipsoid looks unset too.
-    let height = Some(millimetres(m.alt_ellipsoid))
-        .filter(|height_m| *height_m != 0.0 && (height_m - altitude.m()).abs() <= MAX_UNDULATION_M);
-    Ok(GnssPlace {
-        latitude_deg,
-        longitude_deg,
-        altitude,
-        height: height.map(EllipsoidHeight::from_m),
-    })
+fn gps2_raw(m: &dialect::GPS2_RAW_DATA) -> Result<GpsRaw, DecodeError> {
+    WireGps {
+        message: "GPS2_RAW",
+        time_us: m.time_usec,
+        fix_type: m.fix_type,
+        place: (m.lat, m.lon),
+        alt_mm: m.alt,
+        alt_ellipsoid_mm: m.alt_ellipsoid,
+        accuracy_mm: (m.h_acc, m.v_acc),
+        speed_course: (m.vel, m.cog),
+        satellites: m.satellites_visible,
+    }
+    .read()
+}
+
+/// What the messages of all receivers hold.
+struct WireGps {
+    message: &'static str,
+    time_us: u64,
+    fix_type: dialect::GpsFixType,
+    place: (i32, i32),
+    alt_mm: i32,
+    alt_ellipsoid_mm: i32,
+    accuracy_mm: (u32, u32),
+    speed_course: (u16, u16),
+    satellites: u8,
+}
+
+impl WireGps {
+    fn read(&self) -> Result<GpsRaw, DecodeError> {
+        let fix = gnss_fix(self.fix_type);
+        let (speed_cm_s, course_cdeg) = self.speed_course;
+        Ok(GpsRaw {
+            time: vehicle_time(self.time_us),
+            fix,
+            place: if fix.is_3d() {
+                Some(self.read_place()?)
+            } else {
+                None
+            },
+            horizontal_sigma_m: known_millimetres(self.accuracy_mm.0),
+            vertical_sigma_m: known_millimetres(self.accuracy_mm.1),
+            ground_speed_m_s: (speed_cm_s != u16::MAX).then(|| f64::from(speed_cm_s) * 0.01),
+            course_rad: (course_cdeg <= 36_000).then(|| centidegrees(course_cdeg)),
+            satellites: (self.satellites != u8::MAX).then_some(self.satellites),
+        })
+    }
+
+    fn read_place(&self) -> Result<GnssPlace, DecodeError> {
+        let wire = WirePlace {
+            message: self.message,
+            lat: self.place.0,
+            lon: self.place.1,
+        };
+        let (latitude_deg, longitude_deg) = wire.degrees()?;
+        let altitude = wire.altitude(millimetres(self.alt_mm))?;
+        // An absent extension reads as 0, so that a receiver exactly on the ellipsoid looks unset too.
+        let height = Some(millimetres(self.alt_ellipsoid_mm)).filter(|height_m| {
+            *height_m != 0.0 && (height_m - altitude.m()).abs() <= MAX_UNDULATION_M
+        });
+        Ok(GnssPlace {
+            latitude_deg,
+            longitude_deg,
+            altitude,
+            height: height.map(EllipsoidHeight::from_m),
+        })
+    }
 }
 
 fn gnss_fix(fix: dialect::GpsFixType) -> GnssFix {
@@ -743,6 +835,7 @@ fn home_position(m: &dialect::HOME_POSITION_DATA) -> Result<HomePosition, Decode
 fn gimbal_attitude(
     m: &dialect::GIMBAL_DEVICE_ATTITUDE_STATUS_DATA,
 ) -> Result<GimbalDeviceAttitude, DecodeError> {
+    use dialect::GimbalDeviceErrorFlags as Faults;
     use dialect::GimbalDeviceFlags as Flags;
     const MESSAGE: &str = "GIMBAL_DEVICE_ATTITUDE_STATUS";
     let checked = Attitude::from_mavlink_quaternion(m.q.map(f64::from)).map_err(|source| {
@@ -764,15 +857,27 @@ fn gimbal_attitude(
         .flags
         .contains(Flags::GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME);
     let locked = m.flags.contains(Flags::GIMBAL_DEVICE_FLAGS_YAW_LOCK);
+    if earth && vehicle {
+        return Err(DecodeError::TwoYawFrames { message: MESSAGE });
+    }
     let from_north = earth || (locked && !vehicle);
+    let faults = Faults::GIMBAL_DEVICE_ERROR_FLAGS_ENCODER_ERROR
+        | Faults::GIMBAL_DEVICE_ERROR_FLAGS_SOFTWARE_ERROR
+        | Faults::GIMBAL_DEVICE_ERROR_FLAGS_COMMS_ERROR
+        | Faults::GIMBAL_DEVICE_ERROR_FLAGS_CALIBRATION_RUNNING;
     Ok(GimbalDeviceAttitude {
         boot: BootTime::from_ms(m.time_boot_ms),
+        device: m.gimbal_device_id,
         quaternion: checked.quaternion(),
         yaw: if from_north {
             GimbalYaw::FromNorth
         } else {
             GimbalYaw::FromNose
         },
+        // Without a yaw frame flag the field is to be ignored; absent, the extension reads as 0.
+        nose_rad: Some(f64::from(m.delta_yaw))
+            .filter(|yaw| (earth || vehicle) && yaw.is_finite() && *yaw != 0.0),
+        is_faulty: m.failure_flags.intersects(faults),
         rate_rad_s: finite_vector(MESSAGE, "rate", rates).ok(),
     })
 }

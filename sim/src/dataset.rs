@@ -354,6 +354,7 @@ fn random_world(rng: &mut ChaCha8Rng) -> WorldConfig {
         terrain_up_m: 0.0,
         ground: random_ground(rng),
         fires: (0..fires).map(|k| random_fire(rng, k)).collect(),
+        spreads: Vec::new(),
         smokes: (0..smokes).map(|k| random_smoke(rng, k)).collect(),
         lookalikes: (0..lookalikes).map(|_| random_lookalike(rng)).collect(),
         boards: Vec::new(),

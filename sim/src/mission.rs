@@ -6,6 +6,7 @@
 use crate::autopilot::{AutopilotConfig, ErrorsConfig};
 use crate::earth::Lla;
 use crate::flight::{FlightConfig, PathConfig};
+use crate::spectrometer::SpectrometerConfig;
 use crate::world::WorldConfig;
 use emberfix_calib::{Rig, RigError};
 use emberfix_frames::ServiceTime;
@@ -91,6 +92,9 @@ pub struct SimConfig {
     /// How wrong the sensors are.
     #[serde(default)]
     pub errors: ErrorsConfig,
+    /// A spectrometer in step with the frames, if there is one.
+    #[serde(default)]
+    pub spectrometer: Option<SpectrometerConfig>,
     /// What is there.
     pub world: WorldConfig,
 }

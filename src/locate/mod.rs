@@ -9,9 +9,11 @@
 //! its covariance, but only [`crate::track`] knows that they do not average out.
 
 mod geometry;
+mod shared;
 mod terrain;
 
-pub use geometry::{SHARED, Shared, SharedSigmas, View};
+pub use geometry::{Distant, Lens, Linear, Motion, Predicted, View, range_beneath};
+pub use shared::{CONSTANT, SHARED, Shared, SharedPriors, WANDERING};
 pub use terrain::{
     Area, ConstantPlane, Coverage, Ground, Terrain, TerrainHit, Tile, TileError, TileParts,
     TileSigmas, Tiles, VerticalDatum, meet_terrain,

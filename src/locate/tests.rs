@@ -5,9 +5,15 @@ use emberfix_calib::{RectifiedPixel, Rig};
 use emberfix_frames::{Attitude, Ecef, EllipsoidHeight, Matrix3, Vector3, Wgs84Parts, enu_offset};
 use std::f64::consts::FRAC_PI_2;
 
-const SIGMAS: SharedSigmas = SharedSigmas {
+pub(super) const SIGMAS: SharedPriors = SharedPriors {
+    gnss_constant_share: 0.5,
+    gnss_correlation_s: 100.0,
     heading_rad: 0.03,
+    heading_constant_share: 0.5,
+    heading_correlation_s: 100.0,
     tilt_rad: 0.005,
+    tilt_constant_share: 0.5,
+    tilt_correlation_s: 100.0,
 };
 const CENTRE: RectifiedPixel = RectifiedPixel { u: 640.0, v: 360.0 };
 
@@ -76,49 +82,134 @@ fn the_chain_to_longitude_and_latitude_mends_the_printed_forms() {
     assert!((enu_offset(&datum(), &place) - point).norm() < 1e-6);
 }
 
-/// Each column of the model against what a really perturbed pose sees, by central differences.
+type Perturb = fn(&mut Pose, f64);
+
+/// Index of an error, its size (metres, radians), and what it does to the reported pose.
+const ERRORS: [(usize, f64, Perturb); 6] = [
+    (Shared::GnssConstant as usize, 2.0, |p, e| {
+        shift(p, Vector3::new(e, 0.0, 0.0))
+    }),
+    (Shared::Gnss as usize + 2, -3.0, |p, e| {
+        shift(p, Vector3::new(0.0, 0.0, e))
+    }),
+    (Shared::HeadingConstant as usize, 0.05, turn_heading),
+    (Shared::Boresight as usize, -0.05, |p, e| {
+        turn_body(p, Vector3::new(e, 0.0, 0.0))
+    }),
+    (Shared::Tilt as usize + 1, 0.05, |p, e| {
+        turn_body(p, Vector3::new(0.0, e, 0.0))
+    }),
+    (Shared::AttitudeJitter as usize + 2, 0.03, |p, e| {
+        turn_body(p, Vector3::new(0.0, 0.0, e))
+    }),
+];
+
+fn in_sigmas(view: &View<'_>, index: usize, error: f64) -> nalgebra::SVector<f64, SHARED> {
+    let mut shared = nalgebra::SVector::zeros();
+    shared[index] = error / view.sigmas()[index];
+    shared
+}
+
+/// Three degrees and metres: no expansion about nothing would do.
 #[test]
-fn shared_errors_move_the_prediction_as_the_model_says() {
+fn a_reported_pose_with_its_error_taken_out_sees_what_the_true_one_sees() {
     let (rig, truth) = (rig(30.0), pose(0.1, -0.05, 0.7));
     let point = point_on_axis(&truth, &rig, 20.0) + Vector3::new(1.0, -2.0, 0.5);
-    let view = View::new(&rig, &truth, &SIGMAS, &datum());
-    let model = view.predict(&point).unwrap();
-    type Perturb = fn(&mut Pose, f64);
-    let cases: [(usize, f64, Perturb); 6] = [
-        (Shared::GnssEast as usize, 1e-3, |p, e| {
-            shift(p, Vector3::new(e, 0.0, 0.0))
-        }),
-        (Shared::GnssEast as usize + 2, 1e-3, |p, e| {
-            shift(p, Vector3::new(0.0, 0.0, e))
-        }),
-        (Shared::Heading as usize, 1e-5, |p, e| turn_heading(p, e)),
-        (Shared::BodyRoll as usize, 1e-5, |p, e| {
-            turn_body(p, Vector3::new(e, 0.0, 0.0))
-        }),
-        (Shared::BodyRoll as usize + 1, 1e-5, |p, e| {
-            turn_body(p, Vector3::new(0.0, e, 0.0))
-        }),
-        (Shared::Clock as usize, 1e-5, |p, e| {
-            shift(p, p.velocity_enu_m_s * e);
-            turn_body(p, p.rate_rad_s * e);
-        }),
-    ];
-    for (index, step, perturb) in cases {
-        // The pixel that the true pose sees is fixed; a reported pose with an error places the
-        // point at p + D e, so by_shared e must equal the change of pixel from p to p + D e.
+    let seen = View::new(&rig, &truth, &SIGMAS, &datum())
+        .predict(&point)
+        .unwrap();
+    for (index, error, perturb) in ERRORS {
         let mut reported = truth.clone();
-        perturb(&mut reported, step);
-        let other = View::new(&rig, &reported, &SIGMAS, &datum());
-        let x_true = view.enu_from_cam.transpose() * (point - view.camera_enu);
-        let placed = other.camera_enu + other.enu_from_cam * x_true;
-        let seen = view.predict(&placed).unwrap();
-        let change = nalgebra::vector![seen.pixel.u - model.pixel.u, seen.pixel.v - model.pixel.v];
-        let expected = model.by_shared.column(index) * step;
-        let limit = 0.01 * expected.norm() + 1e-6;
-        assert!(
-            (change - expected).norm() < limit,
-            "{index}: {change} against {expected}"
-        );
+        perturb(&mut reported, error);
+        let view = View::new(&rig, &reported, &SIGMAS, &datum());
+        let lens = view.lens(&in_sigmas(&view, index, error), 0.0);
+        let mended = lens.predict(&Distant::near(point)).unwrap();
+        let off = (mended.pixel.u - seen.pixel.u).hypot(mended.pixel.v - seen.pixel.v);
+        // The tangent planes of the two places differ by their distance over the Earth's radius.
+        assert!(off < 0.01, "{index}: {off} px");
+    }
+}
+
+/// A vehicle that swings: its attitude 300 ms later has nothing to do with its present rate.
+fn swinging(later_s: f64) -> Option<Pose> {
+    let mut pose = pose(
+        0.2 * (4.0 * later_s).sin(),
+        0.1 * (6.0 * later_s).cos(),
+        0.7,
+    );
+    shift(&mut pose, Vector3::new(5.0 * later_s, 2.0 * later_s, 0.0));
+    Some(pose)
+}
+
+#[test]
+fn a_clock_error_takes_the_pose_of_another_moment() {
+    let rig = rig(30.0);
+    let (reported, truth) = (swinging(0.3).unwrap(), swinging(0.0).unwrap());
+    let point = point_on_axis(&truth, &rig, 20.0) + Vector3::new(1.0, -2.0, 0.5);
+    let seen = View::new(&rig, &truth, &SIGMAS, &datum())
+        .predict(&point)
+        .unwrap();
+    let motion = |later_s: f64| swinging(0.3 + later_s);
+    let view = View::new(&rig, &reported, &SIGMAS, &datum()).with_motion(&motion);
+    let shared = in_sigmas(&view, Shared::Clock as usize, 0.3);
+    let mended = view
+        .lens(&shared, 0.0)
+        .predict(&Distant::near(point))
+        .unwrap();
+    let off = (mended.pixel.u - seen.pixel.u).hypot(mended.pixel.v - seen.pixel.v);
+    assert!(off < 0.01, "{off} px");
+}
+
+#[test]
+fn a_vague_clock_widens_the_errors_of_the_frame_by_what_the_motion_bends() {
+    let (rig, reported) = (rig(30.0), swinging(0.0).unwrap());
+    let point = point_on_axis(&reported, &rig, 20.0);
+    let view = View::new(&rig, &reported, &SIGMAS, &datum()).with_motion(&swinging);
+    let jitter_px = |clock_sigma: f64| {
+        let lens = view.lens(&nalgebra::SVector::zeros(), clock_sigma);
+        let linear = lens.linear(&Distant::near(point)).unwrap();
+        linear.by_shared[(0, Shared::AttitudeJitter as usize + 2)].abs()
+    };
+    let vague = 0.2 / view.sigmas()[Shared::Clock as usize];
+    assert!(jitter_px(vague) > 10.0 * jitter_px(0.0));
+}
+
+/// Every slope against differences of the model itself, for a near point and a distant one.
+#[test]
+fn slopes_are_those_of_the_model() {
+    let (rig, reported) = (rig(30.0), pose(0.1, -0.05, 0.7));
+    let view = View::new(&rig, &reported, &SIGMAS, &datum());
+    let near = point_on_axis(&reported, &rig, 20.0) + Vector3::new(1.0, -2.0, 0.5);
+    let far = Distant {
+        at: near * 0.02,
+        over: 0.02,
+    };
+    let at = nalgebra::SVector::<f64, SHARED>::from_fn(|i, _| 0.3 - 0.02 * i as f64);
+    for point in [Distant::near(near), far] {
+        let linear = view.lens(&at, 0.0).linear(&point).unwrap();
+        let value = |shared: &nalgebra::SVector<f64, SHARED>, point: &Distant| {
+            view.lens(shared, 0.0).linear(point).unwrap().value
+        };
+        for index in 0..SHARED {
+            let mut step = nalgebra::SVector::zeros();
+            step[index] = 1e-3;
+            let slope = (value(&(at + step), &point) - value(&(at - step), &point)) / 2e-3;
+            let model = linear.by_shared.column(index);
+            // Angles of three sigmas turn each other's axes a little.
+            let limit = 0.03 * slope.norm() + 1e-3;
+            assert!((slope - model).norm() < limit, "{index}: {slope} {model}");
+        }
+        for axis in 0..3 {
+            let mut moved = point;
+            moved.at[axis] += 1e-5;
+            let slope = (value(&at, &moved) - linear.value) / 1e-5;
+            let limit = 1e-3 * slope.norm() + 1e-3;
+            assert!((slope - linear.by_at.column(axis)).norm() < limit);
+        }
+        let mut moved = point;
+        moved.over += 1e-7;
+        let slope = (value(&at, &moved) - linear.value) / 1e-7;
+        assert!((slope - linear.by_over).norm() < 1e-3 * slope.norm());
     }
 }
 

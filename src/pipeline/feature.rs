@@ -2,17 +2,16 @@
 
 use crate::alarm::Situation;
 use crate::detect::BoxPx;
-use crate::locate::View;
-use crate::track::{Classified, Outcome};
+use crate::locate::{Fix, View};
+use crate::track::Classified;
 use emberfix_frames::{HeightAboveGround, Metres, Wgs84Parts};
 use serde_json::{Value, json};
 
 /// The Feature; its geometry is `null` when one look gives no position.
 pub fn sighting(
     classified: &Classified,
-    outcome: &Outcome,
     box_px: BoxPx,
-    situation: Option<&Situation>,
+    placed: Option<(&Fix, &Situation)>,
     view: &View<'_>,
 ) -> Value {
     let mut properties = json!({
@@ -23,7 +22,7 @@ pub fn sighting(
         "glow": classified.sighting.glow,
         "disparity_px": classified.sighting.disparity.map(|disparity| disparity.px),
     });
-    let (Some(fix), Some(situation)) = (&outcome.fix, situation) else {
+    let Some((fix, situation)) = placed else {
         return json!({"type": "Feature", "geometry": null, "properties": properties});
     };
     let size = crate::assess::size(&classified.sighting, view, &fix.enu.metres());

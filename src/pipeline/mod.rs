@@ -11,25 +11,28 @@
 
 mod counters;
 mod feature;
+mod light;
 mod vision;
 
 pub use counters::Counters;
 pub use vision::{Seen, Vision};
 
-use crate::alarm::{Alarm, AlarmDesk, FireId, Situation};
+use crate::alarm::{Alarm, AlarmDesk, Area, FireId, Situation};
+use crate::assess::extent::{Extent, Wind};
+use crate::assess::watch::{Assessment, Assessor, Light};
 use crate::detect::{Detection, Detector};
 use crate::ingest::StereoPair;
-use crate::locate::{SharedSigmas, Terrain, View};
+use crate::locate::{Ground, SharedPriors, Terrain, View, fix};
 use crate::mission::Mission;
 use crate::pose::{Pose, PoseAnswer, PoseEstimator};
 use crate::range::Ranger;
-use crate::track::{Fire, Outcome, Tracker};
+use crate::track::{Classified, Fire, Outcome, Tracker};
 use emberfix_calib::Rig;
 use emberfix_frames::{
-    ServiceTime, SignedDuration, Stamped, TimeSyncSample, Wgs84, Wgs84Parts, ecef_from_enu,
-    place_from_ecef, seconds,
+    Coordinate, GeoidUndulation, Metres, MissionEnu, ServiceTime, SignedDuration, Stamped,
+    TimeSyncSample, Vector3, Wgs84, Wgs84Parts, ecef_from_enu, place_from_ecef, seconds,
 };
-use emberfix_mav::telemetry::{GpsRaw, TimeSyncMessage};
+use emberfix_mav::telemetry::{GpsRaw, TimeSyncMessage, WindEstimate};
 use emberfix_mav::{Address, Received, SystemId, Telemetry};
 use std::sync::Arc;
 
@@ -77,10 +80,12 @@ pub struct Pipeline {
     rig: Arc<Rig>,
     datum: Wgs84,
     terrain: Option<Arc<dyn Terrain>>,
-    shared: SharedSigmas,
+    shared: SharedPriors,
     vision: Vision,
     poses: PoseEstimator,
     tracker: Tracker,
+    assessor: Assessor,
+    wind: Option<Stamped<Wind>>,
     desk: AlarmDesk,
     autopilot: AutopilotLock,
     waiting: Option<Box<Stamped<StereoPair>>>,
@@ -101,6 +106,10 @@ struct AutopilotLock {
     system: Option<SystemId>,
 }
 
+/// One sigma of a stated wind whose error is not stated, m/s.
+const WIND_SIGMA_M_S: f64 = 1.0;
+/// A stated wind older than this is not used.
+const WIND_AGE: SignedDuration = SignedDuration::from_secs(30);
 /// A pair or a position older than this makes the pipeline unhealthy.
 const SILENCE: SignedDuration = SignedDuration::from_secs(3);
 
@@ -122,6 +131,8 @@ impl Pipeline {
             vision: Vision::new(&mission.rig, detector, ranger),
             poses: PoseEstimator::new(mission.pose),
             tracker: Tracker::new(mission.track, first_fire),
+            assessor: Assessor::default(),
+            wind: None,
             desk: AlarmDesk::new(mission.uav.clone()),
             autopilot: AutopilotLock { system },
             waiting: None,
@@ -202,6 +213,14 @@ impl Pipeline {
         {
             self.autopilot.system = Some(received.system());
         }
+        if let Telemetry::GimbalDeviceAttitude(said) = telemetry
+            && self.autopilot.system == Some(received.system())
+        {
+            let taken = self.poses.add_gimbal(received.component(), self.now, said);
+            self.counters
+                .add("gimbal", if taken { "taken" } else { "refused" });
+            return;
+        }
         if !self.autopilot.is(received.frame.sender()) {
             self.counters.add("mavlink", "other_sender");
             return;
@@ -230,6 +249,18 @@ impl Pipeline {
                 self.counters.add("telemetry", "position");
             }
             Telemetry::GpsRaw(raw) => self.take_gnss(raw),
+            Telemetry::Gps2Raw(raw) => {
+                if let Some(separation) = separation(raw) {
+                    self.poses.add_second_separation(separation);
+                }
+                self.counters.add("telemetry", "second_gnss");
+            }
+            Telemetry::EstimatorStatus(status) => {
+                self.poses
+                    .add_vertical_validity(status.flags.vertical_position());
+                self.counters.add("telemetry", "estimator_status");
+            }
+            Telemetry::Wind(wind) => self.take_wind(wind),
             Telemetry::SystemTime(time) if time.utc_is_absurd() => {
                 self.counters.add("mavlink_refused", "absurd_utc");
             }
@@ -238,12 +269,12 @@ impl Pipeline {
     }
 
     fn take_gnss(&mut self, raw: &GpsRaw) {
-        let separation = raw
-            .place
-            .and_then(|place| place.height.map(|height| height - place.altitude));
         let sigmas = (raw.horizontal_sigma_m, raw.vertical_sigma_m);
         self.poses
-            .add_gnss(self.now, raw.fix.is_3d(), sigmas, separation);
+            .add_gnss(self.now, raw.fix.is_3d(), sigmas, separation(raw));
+        if let Some(place) = raw.place {
+            self.poses.add_gnss_altitude(self.now, place.altitude);
+        }
         self.counters.add(
             "telemetry",
             if raw.fix.is_3d() {
@@ -290,6 +321,11 @@ impl Pipeline {
             return Vec::new();
         };
         let moment = pair.at + seconds(self.rig.time_offset_s());
+        let last_needed = moment + seconds(self.tracker.looks_ahead_s());
+        if self.poses.at(last_needed, self.now) == PoseAnswer::NotYet {
+            self.waiting = Some(pair);
+            return Vec::new();
+        }
         match self.poses.at(moment, self.now) {
             PoseAnswer::NotYet => {
                 self.waiting = Some(pair);
@@ -308,6 +344,21 @@ impl Pipeline {
                 limit,
             } => self.without_pose("pose_stale", || {
                 format!("{what} is {nearest:#} away from the shutter, limit {limit:#}")
+            }),
+            PoseAnswer::Conflict {
+                what,
+                apart_deg,
+                limit_deg,
+            } => self.without_pose("pose_conflict", || {
+                format!("{what} are {apart_deg:.0} degrees apart, limit {limit_deg:.0}")
+            }),
+            PoseAnswer::TooFast {
+                turned_deg,
+                limit_deg,
+            } => self.without_pose("too_fast_for_shutter", || {
+                format!(
+                    "the camera turned {turned_deg:.1} degrees within one readout, limit {limit_deg:.1}"
+                )
             }),
             PoseAnswer::NoGnssFix => self.without_pose("no_gnss_fix", || {
                 "GNSS has no 3D fix: no positions".to_owned()
@@ -332,13 +383,13 @@ impl Pipeline {
         if seen.mono {
             self.degraded.push(crate::pose::Degraded::Mono.name());
         }
-        let terrain = self.terrain.clone();
         let sightings: Vec<_> = seen
             .sightings
             .iter()
             .map(|(_, sighting)| *sighting)
             .collect();
-        let outcomes = self.tracker.step(&view, &sightings, terrain.as_deref());
+        let outcomes = self.track(&view, &sightings);
+        self.assess(pair, &seen, &outcomes, &view);
         let mut outputs = vec![Output::Pose(Box::new(pose.clone()))];
         for outcome in &outcomes {
             outputs.push(self.fix_output(&seen, outcome, &view));
@@ -347,41 +398,130 @@ impl Pipeline {
             at: pair.at,
             found: seen.found,
         });
-        outputs.extend(self.alarms());
+        outputs.extend(self.alarms(&view));
         outputs
+    }
+
+    /// The tracker may ask where the vehicle was at other moments: the clock error is one of its states.
+    fn track(&mut self, view: &View<'_>, sightings: &[Classified]) -> Vec<Outcome> {
+        let (now, poses) = (self.now, &self.poses);
+        let motion = |later_s: f64| match poses.at(view.pose.at + seconds(later_s), now) {
+            PoseAnswer::Fresh(pose) => Some(*pose),
+            _ => None,
+        };
+        let view = view.clone().with_motion(&motion);
+        self.tracker.step(&view, sightings, self.terrain.as_deref())
+    }
+
+    fn take_wind(&mut self, wind: &WindEstimate) {
+        self.counters.add("telemetry", "wind");
+        self.wind = Some(Stamped {
+            at: self.now,
+            value: Wind {
+                towards_m_s: wind.towards_enu_m_s.xy(),
+                sigma_m_s: wind.horizontal_sigma_m_s.unwrap_or(WIND_SIGMA_M_S),
+            },
+        });
+    }
+
+    /// What the frame says of how each fire burns.
+    fn assess(
+        &mut self,
+        pair: &Stamped<StereoPair>,
+        seen: &Seen,
+        outcomes: &[Outcome],
+        view: &View<'_>,
+    ) {
+        let spectral = self.spectral(pair, outcomes);
+        let fresh = self
+            .wind
+            .as_ref()
+            .filter(|wind| self.now - wind.at < WIND_AGE);
+        let wind = fresh.map(|wind| wind.value);
+        let fires = self.tracker.fires();
+        for outcome in outcomes {
+            let Some(fire) = fires.iter().find(|fire| Some(fire.id) == outcome.fire) else {
+                continue;
+            };
+            let light = Light {
+                visible: seen.flames.get(outcome.index).copied().flatten(),
+                spectral,
+            };
+            let sighting = &seen.sightings[outcome.index].1.sighting;
+            self.assessor
+                .note(fire, sighting, view, light, wind.as_ref());
+        }
+        self.assessor
+            .keep(|id| fires.iter().any(|fire| fire.id == id));
+    }
+
+    /// Mean light of the lines since the pair before. The instrument sees the whole scene, so it
+    /// speaks of a fire only when one alone is seen.
+    fn spectral(&mut self, pair: &Stamped<StereoPair>, outcomes: &[Outcome]) -> Option<f64> {
+        let mut lights = Vec::new();
+        for spectrum in &pair.value.spectra {
+            let light = spectrum.line_light();
+            let name = if light.is_some() {
+                "read"
+            } else {
+                "no_line_or_full"
+            };
+            self.counters.add("spectrometer", name);
+            lights.extend(light);
+        }
+        let seen = outcomes
+            .iter()
+            .filter(|outcome| outcome.fire.is_some())
+            .count();
+        if seen != 1 && !lights.is_empty() {
+            self.counters.add("spectrometer", "not_one_fire_alone");
+        }
+        let usable = seen == 1 && !lights.is_empty();
+        usable.then(|| lights.iter().sum::<f64>() / lights.len() as f64)
     }
 
     fn fix_output(&mut self, seen: &Seen, outcome: &Outcome, view: &View<'_>) -> Output {
         let (found, classified) = &seen.sightings[outcome.index];
         let at = classified.sighting.at;
-        let situation = outcome.fix.as_ref().map(|fix| {
+        let fix = fix(&classified.sighting, view, self.terrain.as_deref());
+        let situation = fix.as_ref().map(|fix| {
             let mut situation = situate(&fix.place, &self.poses, self.terrain.as_deref());
-            situation.degraded = self
-                .degraded
-                .iter()
-                .map(|reason| (*reason).to_owned())
-                .collect();
+            let reasons = self.degraded.iter().map(|reason| (*reason).to_owned());
+            situation.degraded.extend(reasons);
             situation
         });
         let box_px = seen.found[*found].box_px;
-        let feature = feature::sighting(classified, outcome, box_px, situation.as_ref(), view);
+        let placed = fix.as_ref().zip(situation.as_ref());
+        let feature = feature::sighting(classified, box_px, placed, view);
         Output::Fix {
             at,
             feature: self.desk.signed(outcome.fire, feature),
         }
     }
 
-    fn alarms(&mut self) -> Vec<Output> {
+    fn alarms(&mut self, view: &View<'_>) -> Vec<Output> {
         let (datum, terrain) = (self.datum, self.terrain.clone());
-        let (poses, degraded) = (&self.poses, &self.degraded);
-        let due = self.desk.due(self.tracker.fires(), |fire| {
+        let (poses, degraded, tracker) = (&self.poses, &self.degraded, &self.tracker);
+        let assessor = &self.assessor;
+        let due = self.desk.due(tracker.fires(), |fire| {
             let place = place_from_ecef(&ecef_from_enu(&datum).transform(fire.position()))?;
             let mut situation = situate(&place, poses, terrain.as_deref());
-            situation.degraded = degraded.iter().map(|reason| (*reason).to_owned()).collect();
+            situation.advice = tracker.advise(fire, view);
+            let reasons = degraded.iter().map(|reason| (*reason).to_owned());
+            situation.degraded.extend(reasons);
             situation.degraded.extend(
                 fire.merged_into
                     .map(|into| format!("merged_into_{}", into.0)),
             );
+            if let Some(assessment) = assessor.of(fire.id) {
+                let channels = assessment.reasons.iter().map(|reason| (*reason).to_owned());
+                situation.degraded.extend(channels);
+                situation.area = assessment
+                    .extent
+                    .as_ref()
+                    .and_then(|extent| area(extent, &datum));
+                situation.assessment = assessment.clone();
+            }
             Some(situation)
         });
         due.into_iter()
@@ -397,13 +537,47 @@ impl AutopilotLock {
     }
 }
 
+/// Ellipsoid height minus altitude, where a receiver gives both.
+fn separation(raw: &GpsRaw) -> Option<GeoidUndulation> {
+    raw.place
+        .and_then(|place| place.height.map(|height| height - place.altitude))
+}
+
 /// Altitude and height above ground of a place.
 fn situate(place: &Wgs84, poses: &PoseEstimator, terrain: Option<&dyn Terrain>) -> Situation {
-    let ground = terrain.and_then(|terrain| terrain.height_at(place));
+    let (ground, degraded) = match terrain.map(|terrain| terrain.ground_at(place)) {
+        None => (None, None),
+        Some(Ground::Known { height, .. }) => (Some(height), None),
+        Some(Ground::Void) => (None, Some("terrain_void")),
+        Some(Ground::OffTiles) => (None, Some("terrain_off_tiles")),
+    };
     Situation {
         place: *place,
+        advice: None,
         altitude: place.height() - poses.undulation(place),
         above_ground: ground.map(|ground| place.height() - ground),
-        degraded: Vec::new(),
+            assessment: Assessment::default(),
+            area: None,
+        degraded: degraded.into_iter().map(str::to_owned).collect(),
     }
+}
+
+/// The burning ground on the Earth.
+fn area(extent: &Extent, datum: &Wgs84) -> Option<Area> {
+    let ecef_from_mission = ecef_from_enu::<MissionEnu>(datum);
+    let on_earth = |corner: &nalgebra::Vector2<f64>| -> Option<[f64; 2]> {
+        let point = Vector3::new(corner.x, corner.y, extent.level_m);
+        let place = place_from_ecef(&ecef_from_mission.transform(Coordinate::from_metres(point)))?;
+        Some([place.longitude_deg(), place.latitude_deg()])
+    };
+    Some(Area {
+        polygon: extent
+            .polygon_m
+            .iter()
+            .map(on_earth)
+            .collect::<Option<_>>()?,
+        edge_sigma_m: extent.edge_sigma_m,
+        square_metres: extent.area_m2,
+        front: extent.front.iter().map(on_earth).collect::<Option<_>>()?,
+    })
 }

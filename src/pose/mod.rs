@@ -1,8 +1,11 @@
 //! Where the vehicle was at a shutter time.
 //!
 //! **In:** attitude (50 Hz and up), global position (10 Hz and up), GNSS quality, TIMESYNC; all on
-//! the autopilot's clock. **Out:** [`Pose`] at a moment of the service clock, with the reasons why
-//! it is worse than it could be.
+//! the autopilot's clock; a gimbal's attitude (5 Hz and up) on its own. **Out:** [`Pose`] at a moment
+//! of the service clock, with the reasons why it is worse than it could be.
+//!
+//! With a gimbal, the pose is that of the platform that carries the rig: its place is the gimbal's
+//! pivot, its attitude the platform's. Without one it is the airframe's.
 //!
 //! ```text
 //! NeverSeen --first sample--> Fresh --no sample within the limit--> Stale --sample--> Fresh
@@ -12,16 +15,23 @@
 //! nothing is interpolated across it. **Known limits.** Attitude and position errors that stay the
 //! same from frame to frame are not in the pose: they are the estimator's shared errors.
 
+mod gimbal;
+mod heights;
 mod history;
 
+pub use gimbal::GimbalConfig;
 pub use history::{Bracket, History};
 
 use emberfix_frames::{
-    Attitude, BootTime, EllipsoidHeight, Geoid, GeoidUndulation, MslAltitude, ServiceTime,
-    SignedDuration, SyncQuality, TimeSync, TimeSyncSample, Vector3, Wgs84, Wgs84Parts,
-    ecef_from_enu, place_from_degrees,
+    Attitude, BootTime, EllipsoidHeight, GeoidUndulation, MslAltitude, ServiceTime, SignedDuration,
+    SyncQuality, TimeSync, TimeSyncSample, Vector3, Wgs84, Wgs84Parts, ecef_from_enu,
+    place_from_degrees,
 };
 use emberfix_frames::{Coordinate, Metres, VehicleEnu};
+use emberfix_mav::ComponentId;
+use emberfix_mav::telemetry::GimbalDeviceAttitude;
+use gimbal::{Airframe, Gimbal, Platform};
+use heights::{Heights, Separation};
 use std::collections::BTreeSet;
 
 /// Why a pose, and with it a position, is worse than it could be.
@@ -37,6 +47,16 @@ pub enum Degraded {
     AttitudeSlow,
     /// Position samples are further apart than the limit for interpolation.
     PositionSlow,
+    /// The receiver's separation of geoid and ellipsoid is none: EGM96 is used.
+    GeoidDisagrees,
+    /// The autopilot's altitude jumped or drifted away from the receiver's: barometer alone?
+    AltitudeDisagrees,
+    /// The autopilot says that its vertical position is not valid.
+    AltitudeNotEstimated,
+    /// Gimbal samples are further apart than the limit for interpolation.
+    GimbalSlow,
+    /// The camera turned while its rows were exposed one after the other.
+    RollingShutter,
     /// One eye only: no stereo.
     Mono,
 }
@@ -51,6 +71,11 @@ impl Degraded {
             Self::GeoidApplied => "geoid_applied",
             Self::AttitudeSlow => "attitude_slow",
             Self::PositionSlow => "position_slow",
+            Self::GeoidDisagrees => "geoid_disagrees",
+            Self::AltitudeDisagrees => "altitude_disagrees",
+            Self::AltitudeNotEstimated => "altitude_not_estimated",
+            Self::GimbalSlow => "gimbal_slow",
+            Self::RollingShutter => "rolling_shutter",
             Self::Mono => "mono",
         }
     }
@@ -106,6 +131,22 @@ pub enum PoseAnswer {
     },
     /// GNSS has no three-dimensional fix: any position would be false.
     NoGnssFix,
+    /// Two sources contradict each other: one of them is false.
+    Conflict {
+        /// Which.
+        what: &'static str,
+        /// How far they are apart, degrees.
+        apart_deg: f64,
+        /// What would have been accepted, degrees.
+        limit_deg: f64,
+    },
+    /// The camera turned too far while its rows were exposed.
+    TooFast {
+        /// By how much, degrees.
+        turned_deg: f64,
+        /// What would have been accepted, degrees.
+        limit_deg: f64,
+    },
 }
 
 /// Default errors and limits, from the mission.
@@ -119,6 +160,10 @@ pub struct PoseConfig {
     pub gnss_floor_m: f64,
     /// Furthest that a sample may be from the shutter.
     pub limit: SignedDuration,
+    /// From the exposure of an image's first row to that of its last, seconds.
+    pub rolling_readout_s: f64,
+    /// The gimbal that carries the rig, if one does.
+    pub gimbal: Option<GimbalConfig>,
 }
 
 impl Default for PoseConfig {
@@ -128,6 +173,8 @@ impl Default for PoseConfig {
             gnss_vertical_m: 2.5,
             gnss_floor_m: 0.02,
             limit: SignedDuration::from_millis(500),
+            rolling_readout_s: 0.0,
+            gimbal: None,
         }
     }
 }
@@ -142,6 +189,13 @@ const ATTITUDE_NOISE_RAD: f64 = 0.002;
 const TURN_ACCELERATION_RAD_S2: f64 = 3.0;
 /// Acceleration that interpolation between samples can't see, m/s².
 const ACCELERATION_M_S2: f64 = 2.0;
+/// A turn within one readout beyond this is named, and beyond that gives no pose, radians.
+const ROLLING_NAMED_RAD: f64 = 0.005;
+const ROLLING_REFUSED_RAD: f64 = 0.052;
+/// Vertical sigma of an altitude that the autopilot itself calls not valid, metres.
+const NOT_ESTIMATED_M: f64 = 10.0;
+/// An altitude older than this is not held against the receiver's.
+const ALTITUDE_LIMIT: SignedDuration = SignedDuration::from_secs(1);
 /// Quantisation of MAVLink positions and short noise of the estimator, metres.
 const POSITION_NOISE_M: f64 = 0.05;
 
@@ -175,8 +229,9 @@ pub struct PoseEstimator {
     attitudes: History<AttitudeSample>,
     positions: History<PositionSample>,
     gnss: Option<GnssQuality>,
-    separation: Option<f64>,
-    geoid: Geoid,
+    heights: Heights,
+    latest_altitude: Option<(ServiceTime, MslAltitude)>,
+    gimbal: Option<Gimbal>,
 }
 
 impl PoseEstimator {
@@ -189,8 +244,9 @@ impl PoseEstimator {
             attitudes: History::new(),
             positions: History::new(),
             gnss: None,
-            separation: None,
-            geoid: Geoid::new(),
+            heights: Heights::default(),
+            latest_altitude: None,
+            gimbal: config.gimbal.map(Gimbal::new),
         }
     }
 
@@ -222,6 +278,7 @@ impl PoseEstimator {
         velocity_ned_m_s: Vector3<f64>,
     ) {
         self.note_boot(boot, arrived);
+        self.latest_altitude = Some((arrived, altitude));
         let v = velocity_ned_m_s;
         let velocity_enu_m_s = Vector3::new(v.y, v.x, -v.z);
         self.positions.push(
@@ -251,10 +308,41 @@ impl PoseEstimator {
             horizontal_m,
             vertical_m,
         });
-        if let Some(n) = separation.filter(|_| has_3d_fix) {
-            let old = self.separation.unwrap_or(n.m());
-            self.separation = Some(old + SEPARATION_GAIN * (n.m() - old));
+        if let Some(separation) = separation.filter(|_| has_3d_fix) {
+            self.heights.note_separation(separation);
         }
+    }
+
+    /// Takes the receiver's altitude in, to hold the autopilot's against it.
+    pub fn add_gnss_altitude(&mut self, arrived: ServiceTime, altitude: MslAltitude) {
+        if let Some((at, own)) = self.latest_altitude
+            && arrived - at <= ALTITUDE_LIMIT
+        {
+            self.heights.note_altitudes(own.m(), altitude.m());
+        }
+    }
+
+    /// Takes the separation that a second receiver gives in; it counts while the first gives none.
+    pub fn add_second_separation(&mut self, separation: GeoidUndulation) {
+        self.heights.note_second_separation(separation);
+    }
+
+    /// Takes in whether the autopilot's estimator calls its vertical position valid.
+    pub fn add_vertical_validity(&mut self, valid: bool) {
+        self.heights.note_estimated(valid);
+    }
+
+    /// Takes a gimbal's report in; false when no gimbal carries the rig, when it is another one's,
+    /// or when the gimbal itself reports a fault.
+    pub fn add_gimbal(
+        &mut self,
+        sender: ComponentId,
+        arrived: ServiceTime,
+        said: &GimbalDeviceAttitude,
+    ) -> bool {
+        self.gimbal
+            .as_mut()
+            .is_some_and(|gimbal| gimbal.add(sender, arrived, said))
     }
 
     /// Takes one TIMESYNC exchange in.
@@ -270,12 +358,7 @@ impl PoseEstimator {
 
     /// Geoid undulation at a place: the receiver's own if it gives one, EGM96 otherwise.
     pub fn undulation(&self, place: &Wgs84) -> GeoidUndulation {
-        match self.separation {
-            Some(separation) => GeoidUndulation::from_m(separation),
-            None => self
-                .geoid
-                .undulation(place.latitude_deg(), place.longitude_deg()),
-        }
+        self.heights.undulation(place).0
     }
 
     /// The pose at a moment of the autopilot's clock, given as service time. `now` is the latest
@@ -323,16 +406,36 @@ impl PoseEstimator {
         if !gnss.has_fix {
             return PoseAnswer::NoGnssFix;
         }
-        self.assemble(moment, &attitude, &position, gnss)
+        let airframe = airframe(&attitude);
+        let platform = match &self.gimbal {
+            None => None,
+            Some(gimbal) => {
+                match gimbal.at(moment, boot, &airframe, (self.config.limit, waiting)) {
+                    Ok(platform) => Some(platform),
+                    Err(answer) => return answer,
+                }
+            }
+        };
+        let Some(mut pose) = self.assemble(moment, &airframe, &attitude, &position) else {
+            return PoseAnswer::NeverSeen {
+                what: "a position on the Earth",
+            };
+        };
+        self.judge_gnss(&mut pose, gnss);
+        if let (Some(platform), Some(gimbal)) = (platform, &self.gimbal) {
+            on_platform(&mut pose, &platform, gimbal);
+        }
+        through_shutter(pose, self.config.rolling_readout_s)
     }
 
+    /// The airframe's pose; what is known of its errors by now.
     fn assemble(
         &self,
         moment: ServiceTime,
+        airframe: &Airframe,
         attitude: &Bracket<AttitudeSample>,
         position: &Bracket<PositionSample>,
-        gnss: GnssQuality,
-    ) -> PoseAnswer {
+    ) -> Option<Pose> {
         let mut degraded = BTreeSet::new();
         if self.sync.quality() != SyncQuality::Converged {
             degraded.insert(Degraded::ClockNotSynced);
@@ -343,42 +446,56 @@ impl PoseEstimator {
         if position.gap() > SLOW {
             degraded.insert(Degraded::PositionSlow);
         }
-        if self.separation.is_none() {
-            degraded.insert(Degraded::GeoidApplied);
-        }
-        if gnss.horizontal_m.is_none() || gnss.vertical_m.is_none() {
-            degraded.insert(Degraded::GnssAccuracyUnknown);
-        }
-        let Some(place) = self.place(position) else {
-            return PoseAnswer::NeverSeen {
-                what: "a position on the Earth",
-            };
-        };
-        let (near, share) = (attitude.nearest(), attitude.share());
-        let turned = match attitude.later {
-            Some((_, later)) => attitude.earlier.1.attitude.slerp(&later.attitude, share),
-            None => attitude
-                .earlier
-                .1
-                .attitude
-                .rotated(near.rate_rad_s, attitude.age_s()),
-        };
-        let sigma =
-            |own: Option<f64>, default: f64| own.unwrap_or(default).max(self.config.gnss_floor_m);
-        PoseAnswer::Fresh(Box::new(Pose {
+        Some(Pose {
             at: moment,
-            place,
-            attitude: turned,
-            velocity_enu_m_s: position.nearest().velocity_enu_m_s,
-            rate_rad_s: near.rate_rad_s,
-            gnss_horizontal_m: sigma(gnss.horizontal_m, self.config.gnss_horizontal_m),
-            gnss_vertical_m: sigma(gnss.vertical_m, self.config.gnss_vertical_m),
+            place: self.place(position)?,
+            attitude: airframe.attitude,
+            velocity_enu_m_s: between(position, |sample| sample.velocity_enu_m_s),
+            rate_rad_s: airframe.rate_rad_s,
+            gnss_horizontal_m: self.config.gnss_horizontal_m,
+            gnss_vertical_m: self.config.gnss_vertical_m,
             attitude_noise_rad: ATTITUDE_NOISE_RAD
                 .hypot(unseen(TURN_ACCELERATION_RAD_S2, attitude.span_s())),
             position_noise_m: POSITION_NOISE_M.hypot(unseen(ACCELERATION_M_S2, position.span_s())),
             time_sigma_s: self.sync.sigma_s().unwrap_or(0.0),
             degraded,
-        }))
+        })
+    }
+
+    /// GNSS's own accuracy, and what its heights disagree by. Nothing here makes an error smaller
+    /// than the receiver says it is.
+    fn judge_gnss(&self, pose: &mut Pose, gnss: GnssQuality) {
+        let floor = self.config.gnss_floor_m;
+        if let Some(horizontal_m) = gnss.horizontal_m {
+            pose.gnss_horizontal_m = horizontal_m;
+        }
+        if let Some(vertical_m) = gnss.vertical_m {
+            pose.gnss_vertical_m = vertical_m;
+        }
+        if gnss.horizontal_m.is_none() || gnss.vertical_m.is_none() {
+            pose.degraded.insert(Degraded::GnssAccuracyUnknown);
+        }
+        pose.gnss_horizontal_m = pose.gnss_horizontal_m.max(floor);
+        let stated = pose.gnss_vertical_m.max(floor);
+        let mut doubts = vec![self.heights.watch().disagreement_m()];
+        if self.heights.watch().is_doubtful(stated) {
+            pose.degraded.insert(Degraded::AltitudeDisagrees);
+        }
+        if !self.heights.is_estimated() {
+            pose.degraded.insert(Degraded::AltitudeNotEstimated);
+            doubts.push(NOT_ESTIMATED_M);
+        }
+        match self.heights.undulation(&pose.place).1 {
+            Separation::Receiver => {}
+            Separation::Model => {
+                pose.degraded.insert(Degraded::GeoidApplied);
+            }
+            Separation::ModelAgainstReceiver { by_m } => {
+                pose.degraded.insert(Degraded::GeoidDisagrees);
+                doubts.push(by_m.abs());
+            }
+        }
+        pose.gnss_vertical_m = doubts.into_iter().fold(stated, f64::max);
     }
 
     /// Cubic Hermite between two samples (their velocities count), straight on after the last.
@@ -422,32 +539,8 @@ impl PoseEstimator {
     }
 }
 
-/// Poses at any moment, for whoever learns that the camera's clock is off.
-pub trait PoseAt {
-    /// The pose at a moment of the service clock from what is known by now; `None` where there is
-    /// no honest one.
-    fn pose_at(&self, moment: ServiceTime) -> Option<Pose>;
-}
-
-impl PoseAt for PoseEstimator {
-    fn pose_at(&self, moment: ServiceTime) -> Option<Pose> {
-        match self.at(moment, moment + WAIT) {
-            PoseAnswer::Fresh(pose) => Some(*pose),
-            _ => None,
-        }
-    }
-}
-
-impl<F: Fn(ServiceTime) -> Option<Pose>> PoseAt for F {
-    fn pose_at(&self, moment: ServiceTime) -> Option<Pose> {
-        self(moment)
-    }
-}
-
 /// A boot clock that falls back by this much is a reboot, not a late message.
 const REBOOT: SignedDuration = SignedDuration::from_secs(1);
-/// Share of a new separation that is taken over: 5 Hz GNSS settles in 4 s.
-const SEPARATION_GAIN: f64 = 0.05;
 /// Time that telemetry may take to reach us after the shutter before we go on without it.
 const WAIT: SignedDuration = SignedDuration::from_millis(250);
 
@@ -479,6 +572,69 @@ fn bracket<T: Copy>(
         });
     }
     Ok(found)
+}
+
+/// The airframe at the moment of a bracket: slerp between two samples, turned on after the last.
+fn airframe(attitude: &Bracket<AttitudeSample>) -> Airframe {
+    let earlier = attitude.earlier.1;
+    Airframe {
+        attitude: match attitude.later {
+            Some((_, later)) => earlier.attitude.slerp(&later.attitude, attitude.share()),
+            None => earlier
+                .attitude
+                .rotated(earlier.rate_rad_s, attitude.age_s()),
+        },
+        rate_rad_s: between(attitude, |sample| sample.rate_rad_s),
+    }
+}
+
+/// A vector at the moment of a bracket: straight between two samples, the last one after it.
+fn between<T: Copy>(found: &Bracket<T>, of: impl Fn(&T) -> Vector3<f64>) -> Vector3<f64> {
+    let earlier = of(&found.earlier.1);
+    found.later.map_or(earlier, |(_, later)| {
+        earlier.lerp(&of(&later), found.share())
+    })
+}
+
+/// From the airframe to the gimbal's pivot and the platform on it.
+fn on_platform(pose: &mut Pose, platform: &Platform, gimbal: &Gimbal) {
+    let pivot = pose
+        .attitude
+        .enu_from_body()
+        .transform(emberfix_frames::Vector::from_metres(gimbal.pivot_m()));
+    let offset = Coordinate::<VehicleEnu>::from_metres(pivot.metres());
+    let moved = ecef_from_enu(&pose.place).transform(offset);
+    if let Some(place) = emberfix_frames::place_from_ecef(&moved) {
+        pose.place = place;
+    }
+    pose.attitude = platform.attitude;
+    pose.rate_rad_s = platform.rate_rad_s;
+    pose.attitude_noise_rad = pose.attitude_noise_rad.hypot(platform.noise_rad);
+    pose.time_sigma_s = pose.time_sigma_s.hypot(gimbal.time_sigma_s());
+    if platform.gap > SLOW {
+        pose.degraded.insert(Degraded::GimbalSlow);
+    }
+}
+
+/// A row that is exposed before or after mid-exposure sees the world from another pose: any row's
+/// bearing is off by its share of what the camera turned and moved meanwhile (one sigma of a uniform
+/// spread).
+fn through_shutter(mut pose: Pose, readout_s: f64) -> PoseAnswer {
+    let turned_rad = pose.rate_rad_s.norm() * readout_s;
+    if turned_rad > ROLLING_REFUSED_RAD {
+        return PoseAnswer::TooFast {
+            turned_deg: turned_rad.to_degrees(),
+            limit_deg: ROLLING_REFUSED_RAD.to_degrees(),
+        };
+    }
+    if turned_rad > ROLLING_NAMED_RAD {
+        pose.degraded.insert(Degraded::RollingShutter);
+    }
+    let share = 12_f64.sqrt().recip();
+    let moved_m = pose.velocity_enu_m_s.norm() * readout_s;
+    pose.attitude_noise_rad = pose.attitude_noise_rad.hypot(turned_rad * share);
+    pose.position_noise_m = pose.position_noise_m.hypot(moved_m * share);
+    PoseAnswer::Fresh(Box::new(pose))
 }
 
 /// One sigma of what a constant unseen acceleration does in the middle of a gap: `a h² / 8`.

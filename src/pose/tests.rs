@@ -1,4 +1,6 @@
 use super::*;
+use emberfix_frames::UnitQuaternion;
+use emberfix_mav::telemetry::GimbalYaw;
 use std::f64::consts::FRAC_PI_2;
 
 const START_NS: i64 = 1_772_366_400_000_000_000;
@@ -96,10 +98,10 @@ fn ellipsoid_height_is_msl_plus_the_receivers_own_separation() {
 #[test]
 fn without_a_separation_egm96_is_used_and_said() {
     let mut poses = flying();
-    poses.separation = None;
+    poses.heights = Heights::default();
     let pose = fresh(poses.at(service(2050), service(2110)));
     assert!(pose.degraded.contains(&Degraded::GeoidApplied));
-    let egm96 = Geoid::new().undulation(31.0, 119.0).m();
+    let egm96 = emberfix_frames::Geoid::exact(31.0, 119.0).m();
     assert!(egm96.abs() > 1.0, "a place where the mix-up shows: {egm96}");
     assert!((pose.place.height().m() - 20.0 - egm96).abs() < 0.01);
 }
@@ -149,7 +151,7 @@ fn stale_missing_and_fixless_telemetry_give_no_pose() {
         poses.at(service(2050), service(2110)),
         PoseAnswer::NoGnssFix
     );
-    let mut nothing = PoseEstimator::new(PoseConfig::default());
+    let nothing = PoseEstimator::new(PoseConfig::default());
     assert!(matches!(
         nothing.at(service(0), service(0)),
         PoseAnswer::NeverSeen { .. }
@@ -167,4 +169,394 @@ fn nothing_is_interpolated_across_a_reboot() {
     );
     assert_eq!(poses.attitudes.latest(), Some(BootTime::from_ms(10)));
     assert_eq!(poses.positions.latest(), None);
+}
+
+fn gimballed(readout_s: f64) -> PoseEstimator {
+    let mut poses = PoseEstimator::new(PoseConfig {
+        gimbal: Some(GimbalConfig {
+            pivot_m: Vector3::new(0.5, 0.0, 0.2),
+            component: None,
+            device: 0,
+        }),
+        rolling_readout_s: readout_s,
+        ..PoseConfig::default()
+    });
+    let other = flying();
+    poses.sync = other.sync;
+    poses.attitudes = other.attitudes;
+    poses.positions = other.positions;
+    poses.gnss = other.gnss;
+    poses.heights = other.heights;
+    poses
+}
+
+/// The airframe's heading is 0.1 at 2050 ms.
+const HEADING: f64 = 0.1;
+const GIMBAL: ComponentId = ComponentId(154);
+
+fn gimbal_says(yaw: GimbalYaw, (roll, pitch, heading): (f64, f64, f64)) -> GimbalDeviceAttitude {
+    GimbalDeviceAttitude {
+        boot: BootTime::from_ms(0),
+        device: 0,
+        quaternion: UnitQuaternion::from_euler_angles(roll, pitch, heading),
+        yaw,
+        nose_rad: None,
+        is_faulty: false,
+        rate_rad_s: None,
+    }
+}
+
+/// The same report at 2000 and at 2100 ms, from the autopilot, whose clock it shares.
+fn hold(poses: &mut PoseEstimator, said: GimbalDeviceAttitude) {
+    for ms in [2000_u32, 2100] {
+        let said = GimbalDeviceAttitude {
+            boot: BootTime::from_ms(ms),
+            ..said
+        };
+        assert!(poses.add_gimbal(ComponentId::AUTOPILOT, service(i64::from(ms) + 3), &said));
+    }
+}
+
+/// Where the platform's forward axis points: east, north, up.
+fn forward(pose: &Pose) -> Vector3<f64> {
+    let axis = emberfix_frames::Vector::from_metres(Vector3::x());
+    pose.attitude.enu_from_body().transform(axis).metres()
+}
+
+#[test]
+fn gimbal_yaw_counts_from_the_nose_or_from_north_as_its_frame_says() {
+    let looks = |yaw, angles| {
+        let mut poses = gimballed(0.0);
+        hold(&mut poses, gimbal_says(yaw, angles));
+        forward(&fresh(poses.at(service(2050), service(2110))))
+    };
+    let towards = |heading: f64, down: f64| {
+        Vector3::new(
+            heading.sin() * down.cos(),
+            heading.cos() * down.cos(),
+            -down.sin(),
+        )
+    };
+    let down = 30_f64.to_radians();
+    for (yaw, angles, expected) in [
+        (GimbalYaw::FromNose, (0.0, 0.0, 0.0), towards(HEADING, 0.0)),
+        (
+            GimbalYaw::FromNose,
+            (0.0, 0.0, FRAC_PI_2),
+            towards(HEADING + FRAC_PI_2, 0.0),
+        ),
+        (
+            GimbalYaw::FromNose,
+            (0.0, -down, FRAC_PI_2),
+            towards(HEADING + FRAC_PI_2, down),
+        ),
+        (GimbalYaw::FromNorth, (0.0, 0.0, FRAC_PI_2), Vector3::x()),
+        (
+            GimbalYaw::FromNorth,
+            (0.3, -down, -FRAC_PI_2),
+            towards(-FRAC_PI_2, down),
+        ),
+        (GimbalYaw::FromNorth, (0.0, -FRAC_PI_2, 1.0), -Vector3::z()),
+    ] {
+        let found = looks(yaw, angles);
+        assert!(
+            (found - expected).norm() < 1e-6,
+            "{yaw:?} {angles:?}: {found} {expected}"
+        );
+    }
+}
+
+#[test]
+fn a_stabilised_gimbal_stays_level_and_its_pivot_swings_with_the_airframe() {
+    let mut poses = gimballed(0.0);
+    // Nose to the north, right wing 90 degrees down: 0.2 m below the body is to the left, west.
+    let banked = Attitude::from_angles(FRAC_PI_2, 0.0, 0.0);
+    poses.attitudes.clear();
+    for ms in [2000, 2100] {
+        poses.add_attitude(
+            BootTime::from_ms(ms),
+            service(i64::from(ms) + 3),
+            banked,
+            Vector3::zeros(),
+        );
+    }
+    let fixed = {
+        let mut airframe = flying();
+        airframe.attitudes.clear();
+        for ms in [2000, 2100] {
+            airframe.add_attitude(
+                BootTime::from_ms(ms),
+                service(i64::from(ms) + 3),
+                banked,
+                Vector3::zeros(),
+            );
+        }
+        fresh(airframe.at(service(2050), service(2110))).place
+    };
+    hold(
+        &mut poses,
+        gimbal_says(GimbalYaw::FromNose, (0.0, 0.0, 0.0)),
+    );
+    let pose = fresh(poses.at(service(2050), service(2110)));
+    assert!(
+        (forward(&pose) - Vector3::y()).norm() < 1e-6,
+        "{}",
+        forward(&pose)
+    );
+    assert!(
+        pose.attitude.angles().0.abs() < 1e-6,
+        "the platform is level"
+    );
+    let moved = emberfix_frames::enu_offset(&fixed, &pose.place);
+    assert!(
+        (moved - Vector3::new(-0.2, 0.5, 0.0)).norm() < 1e-6,
+        "{moved}"
+    );
+}
+
+#[test]
+fn a_gimbal_that_turns_has_its_own_rate_and_that_of_the_nose() {
+    let mut poses = gimballed(0.0);
+    poses.attitudes.clear();
+    // The nose turns right by 1 rad/s, the gimbal follows it and tilts down by 0.5 rad/s.
+    for ms in [2000_u32, 2100] {
+        let turned = f64::from(ms - 2000) * 1e-3;
+        let attitude = Attitude::from_angles(0.0, 0.0, turned);
+        poses.add_attitude(
+            BootTime::from_ms(ms),
+            service(i64::from(ms) + 3),
+            attitude,
+            Vector3::z(),
+        );
+        let said = GimbalDeviceAttitude {
+            boot: BootTime::from_ms(ms),
+            ..gimbal_says(GimbalYaw::FromNose, (0.0, -0.5 * turned, 0.0))
+        };
+        assert!(poses.add_gimbal(ComponentId::AUTOPILOT, service(i64::from(ms) + 3), &said));
+    }
+    let pose = fresh(poses.at(service(2050), service(2110)));
+    let (_, pitch, heading) = pose.attitude.angles();
+    assert!((pitch + 0.025).abs() < 1e-6 && (heading - 0.05).abs() < 1e-6);
+    // Half-way it looks 0.025 rad down: the turn about the vertical leaks into the roll axis.
+    assert!(
+        (pose.rate_rad_s - Vector3::new(0.025, -0.5, 1.0)).norm() < 1e-3,
+        "{}",
+        pose.rate_rad_s
+    );
+}
+
+#[test]
+fn a_gimbal_that_is_missing_stale_faulty_or_at_odds_gives_no_pose_by_name() {
+    let ask = |poses: &PoseEstimator| poses.at(service(2050), service(2400));
+    let says = gimbal_says(GimbalYaw::FromNose, (0.0, 0.0, 0.0));
+    assert_eq!(
+        ask(&gimballed(0.0)),
+        PoseAnswer::NeverSeen {
+            what: "gimbal attitude"
+        }
+    );
+
+    let mut stale = gimballed(0.0);
+    let early = GimbalDeviceAttitude {
+        boot: BootTime::from_ms(1000),
+        ..says
+    };
+    assert!(stale.add_gimbal(ComponentId::AUTOPILOT, service(1003), &early));
+    assert!(matches!(
+        ask(&stale),
+        PoseAnswer::Stale {
+            what: "gimbal attitude",
+            ..
+        }
+    ));
+
+    let mut faulty = gimballed(0.0);
+    let broken = GimbalDeviceAttitude {
+        is_faulty: true,
+        ..says
+    };
+    assert!(!faulty.add_gimbal(ComponentId::AUTOPILOT, service(2003), &broken));
+
+    // Yaw said to count from the nose, though it counts from north: the gimbal's own word on the
+    // nose gives it away.
+    let mut odd = gimballed(0.0);
+    hold(
+        &mut odd,
+        GimbalDeviceAttitude {
+            nose_rad: Some(HEADING + 1.0),
+            ..says
+        },
+    );
+    assert!(
+        matches!(ask(&odd), PoseAnswer::Conflict { apart_deg, .. } if (apart_deg - 57.3).abs() < 0.1)
+    );
+    let mut agreed = gimballed(0.0);
+    hold(
+        &mut agreed,
+        GimbalDeviceAttitude {
+            nose_rad: Some(HEADING - 0.2),
+            ..says
+        },
+    );
+    assert!(matches!(ask(&agreed), PoseAnswer::Fresh(_)));
+}
+
+#[test]
+fn another_gimbal_is_not_ours_and_a_gimbal_has_a_clock_of_its_own() {
+    let mut poses = gimballed(0.0);
+    // Booted 7 s after the autopilot; reports take 3 ms.
+    for ms in [1900_u32, 2000, 2100] {
+        let tilt = f64::from(ms - 2000_u32.min(ms)) * 1e-3;
+        let said = GimbalDeviceAttitude {
+            boot: BootTime::from_ms(ms + 60_000),
+            ..gimbal_says(GimbalYaw::FromNorth, (0.0, -tilt, 0.0))
+        };
+        assert!(poses.add_gimbal(GIMBAL, service(i64::from(ms) + 3), &said));
+        assert!(!poses.add_gimbal(ComponentId(171), service(i64::from(ms) + 3), &said));
+        let second = GimbalDeviceAttitude { device: 2, ..said };
+        assert!(!poses.add_gimbal(GIMBAL, service(i64::from(ms) + 3), &second));
+    }
+    let pose = fresh(poses.at(service(2053), service(2110)));
+    assert!(
+        (pose.attitude.angles().1 + 0.05).abs() < 1e-6,
+        "{}",
+        pose.attitude.angles().1
+    );
+    assert!(
+        pose.time_sigma_s >= 0.02,
+        "arrivals alone: {}",
+        pose.time_sigma_s
+    );
+}
+
+#[test]
+fn a_slow_gimbal_is_named_and_unsure() {
+    let mut poses = gimballed(0.0);
+    for ms in [1950_u32, 2150] {
+        let said = GimbalDeviceAttitude {
+            boot: BootTime::from_ms(ms),
+            ..gimbal_says(GimbalYaw::FromNose, (0.0, 0.0, 0.0))
+        };
+        assert!(poses.add_gimbal(ComponentId::AUTOPILOT, service(i64::from(ms) + 3), &said));
+    }
+    let pose = fresh(poses.at(service(2050), service(2160)));
+    assert!(pose.degraded.contains(&Degraded::GimbalSlow));
+    assert!(
+        pose.attitude_noise_rad > 0.014,
+        "{}",
+        pose.attitude_noise_rad
+    );
+}
+
+#[test]
+fn a_rolling_shutter_widens_each_bearing_then_is_named_then_gives_no_pose() {
+    let turning = |rate: f64, readout_s: f64| {
+        let mut poses = PoseEstimator::new(PoseConfig {
+            rolling_readout_s: readout_s,
+            ..PoseConfig::default()
+        });
+        let other = flying();
+        (poses.sync, poses.positions, poses.gnss) = (other.sync, other.positions, other.gnss);
+        poses.heights = other.heights;
+        for ms in [2000_u32, 2100] {
+            let at = BootTime::from_ms(ms);
+            let attitude = Attitude::from_angles(0.0, 0.0, 0.0);
+            poses.add_attitude(
+                at,
+                service(i64::from(ms) + 3),
+                attitude,
+                Vector3::z() * rate,
+            );
+        }
+        poses.at(service(2050), service(2110))
+    };
+    let still = fresh(turning(0.0, 0.02));
+    let global = fresh(turning(0.5, 0.0));
+    assert!(!global.degraded.contains(&Degraded::RollingShutter));
+    let turned = fresh(turning(0.5, 0.02));
+    // 0.5 rad/s over 20 ms: 10 mrad from first row to last, 2.9 mrad one sigma.
+    let added = (turned.attitude_noise_rad.powi(2) - still.attitude_noise_rad.powi(2)).sqrt();
+    assert!((added - 0.010 / 12_f64.sqrt()).abs() < 1e-9, "{added}");
+    assert!(turned.degraded.contains(&Degraded::RollingShutter));
+    // At 10 m/s the camera moves by 0.2 m meanwhile.
+    assert!((still.position_noise_m.powi(2) - global.position_noise_m.powi(2)).sqrt() > 0.05);
+    assert!(
+        matches!(turning(3.0, 0.02), PoseAnswer::TooFast { turned_deg, .. } if turned_deg > 3.4)
+    );
+}
+
+/// PX4 falls back to barometric altitude, or to 0, without a flag.
+#[test]
+fn an_altitude_that_leaves_the_receivers_is_named_and_the_ellipse_is_as_tall_as_the_gap() {
+    let flown = |altitudes: &[f64]| {
+        let mut poses = flying();
+        for altitude in altitudes {
+            poses.latest_altitude = Some((service(2000), MslAltitude::from_m(*altitude)));
+            poses.add_gnss_altitude(service(2001), MslAltitude::from_m(20.0));
+        }
+        fresh(poses.at(service(2050), service(2110)))
+    };
+    let usual = flown(&[20.5; 50]);
+    assert!(!usual.degraded.contains(&Degraded::AltitudeDisagrees));
+    assert!(
+        (usual.gnss_vertical_m - 2.0).abs() < 1e-9,
+        "what the receiver says"
+    );
+    // A filter that is 3 m off for long is no fallback, but no 2 m altitude either.
+    let off = flown(&[23.0; 50]);
+    assert!(!off.degraded.contains(&Degraded::AltitudeDisagrees));
+    assert!((off.gnss_vertical_m - 3.0).abs() < 1e-6);
+    let jumped = flown(&[[20.5; 50].as_slice(), &[29.0; 3]].concat());
+    assert!(jumped.degraded.contains(&Degraded::AltitudeDisagrees));
+    assert!(
+        (jumped.gnss_vertical_m - 9.0).abs() < 1e-6,
+        "{}",
+        jumped.gnss_vertical_m
+    );
+    let zero = flown(&[[540.0; 0].as_slice(), &[0.0; 3]].concat());
+    assert!(zero.degraded.contains(&Degraded::AltitudeDisagrees));
+    let drifted: Vec<f64> = (0..3000).map(|i| 20.0 + 0.005 * f64::from(i)).collect();
+    let drifted = flown(&drifted);
+    assert!(drifted.degraded.contains(&Degraded::AltitudeDisagrees));
+    assert!(drifted.gnss_vertical_m > 10.0);
+    let back = flown(&[[20.5; 50].as_slice(), &[29.0; 3], &[20.5; 3]].concat());
+    assert!(!back.degraded.contains(&Degraded::AltitudeDisagrees));
+}
+
+#[test]
+fn a_vertical_position_that_the_autopilot_calls_invalid_is_named() {
+    let mut poses = flying();
+    poses.add_vertical_validity(false);
+    let pose = fresh(poses.at(service(2050), service(2110)));
+    assert!(pose.degraded.contains(&Degraded::AltitudeNotEstimated));
+    assert!(pose.gnss_vertical_m >= 10.0);
+    poses.add_vertical_validity(true);
+    let pose = fresh(poses.at(service(2050), service(2110)));
+    assert!(pose.degraded.is_empty());
+}
+
+#[test]
+fn a_separation_that_no_geoid_has_is_not_used_and_a_second_receiver_stands_in() {
+    let height = |poses: &PoseEstimator| fresh(poses.at(service(2050), service(2110)));
+    let model = emberfix_frames::Geoid::exact(31.0, 119.0).m();
+
+    let mut absurd = flying();
+    absurd.heights = Heights::default();
+    absurd.add_gnss(
+        service(2000),
+        true,
+        (Some(1.2), Some(2.0)),
+        Some(GeoidUndulation::from_m(model + 40.0)),
+    );
+    let pose = height(&absurd);
+    assert!(pose.degraded.contains(&Degraded::GeoidDisagrees));
+    assert!((pose.place.height().m() - 20.0 - model).abs() < 0.01);
+    assert!((pose.gnss_vertical_m - 40.0).abs() < 0.01);
+
+    let mut second = flying();
+    second.heights = Heights::default();
+    second.add_second_separation(GeoidUndulation::from_m(model + 1.0));
+    let pose = height(&second);
+    assert!(pose.degraded.is_empty(), "{:?}", pose.degraded);
+    assert!((pose.place.height().m() - 21.0 - model).abs() < 0.01);
 }

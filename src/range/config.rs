@@ -133,7 +133,7 @@ impl Default for RangeConfig {
             min_support: 12,
             min_agreement: 0.4,
             min_correlation: 0.6,
-            sigma_floor_px: 0.1,
+            sigma_floor_px: 0.02,
             max_sigma_over_range: 0.35,
         }
     }

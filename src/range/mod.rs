@@ -15,14 +15,22 @@
 //! the disparity came out a quarter too small), so smoke is always [`Ranging::NoMatch`]. The sigma
 //! is that of matching alone: calibration's share stands in the rig.
 
+mod best;
+mod centroid;
 mod config;
 mod correlate;
+mod cross_spectral;
 mod mask;
 mod patch;
 mod pool;
+mod reach;
+mod refine;
+mod scene;
+mod search;
 mod sgbm;
 #[cfg(test)]
 mod tests;
+mod ways;
 
 pub use config::{Method, Methods, RangeConfig};
 pub use mask::HsvMask;
@@ -166,11 +174,7 @@ pub fn open(
     rig: &Rig,
     config: &RangeConfig,
 ) -> Result<Box<dyn Ranger>, RangeError> {
-    Ok(Box::new(sgbm::SgbmRanger::new(
-        method,
-        rig,
-        config.clone(),
-    )?))
+    Ok(Box::new(ways::Ways::new(method, rig, config)?))
 }
 
 /// Why a pair can't be ranged.
@@ -201,4 +205,22 @@ pub enum RangeError {
         #[from]
         source: opencv::Error,
     },
+}
+
+/// Why a method has no disparity: an outcome, or a failure.
+enum Miss {
+    Refused(Refusal),
+    Failed(RangeError),
+}
+
+impl From<Refusal> for Miss {
+    fn from(why: Refusal) -> Self {
+        Self::Refused(why)
+    }
+}
+
+impl From<RangeError> for Miss {
+    fn from(error: RangeError) -> Self {
+        Self::Failed(error)
+    }
 }

@@ -4,6 +4,9 @@
 //! floats, strips or tiles, plain, LZW or Deflate with either predictor; `ModelPixelScale` with
 //! `ModelTiepoint`, or a `ModelTransformation` that does not turn; pixel-is-area and pixel-is-point;
 //! `GDAL_NODATA`. Only the window that is asked for is decoded and kept.
+//!
+//! **Known limits.** The `tiff` crate can't read some LZW tiles that reach over the image's edge
+//! (seen with tiles of 128 pixels and less); they are refused, never read wrongly.
 
 use crate::locate::{Area, VerticalDatum};
 use std::fs::File;
@@ -19,7 +22,7 @@ pub enum GeoTiffError {
     #[error("{0}")]
     Read(#[from] std::io::Error),
     /// It is not a TIFF, or a damaged one, or of a kind that is not read.
-    #[error("{0}")]
+    #[error("{0}; if GDAL reads it, write it anew: gdal_translate -co COMPRESS=DEFLATE")]
     Tiff(#[from] tiff::TiffError),
     /// A tag that places it on the Earth is missing.
     #[error("has no {tag}: a picture without a place")]

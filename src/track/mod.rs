@@ -1,30 +1,51 @@
 //! Fixes to fires: predict, gate, associate, update, initiate, delete.
 //!
 //! **In:** the sightings of one frame, the [`View`] that saw them, the terrain. **Out:** [`Fire`]s in
-//! the plane at the mission datum, each with the covariance of all of its error. Pure: no I/O, no
-//! clock.
+//! the plane at the mission datum, each with the covariance of all of its error; the shared errors
+//! as far as they are known ([`SharedErrors`]). Pure: no I/O, no clock.
 //!
 //! **Estimation.** Bearing, disparity and terrain are fused always and switched never. GNSS offset,
-//! heading, tilt and boresight, disparity offset and clock offset are states that all fires share
-//! ([`Joint`]): what the sightings say about them is learned, what they can't say (a GNSS
-//! offset without a landmark) stays in every ellipse, and nothing averages out as if it were noise.
-//! The terrain's own error is a state of each fire, so that looking twice at the same ground does
-//! not make it better known.
+//! heading, tilt and boresight, lever arm, disparity offset and clock offset are states that all
+//! fires share ([`Common`]): what the sightings say about them is learned, what they can't say (a
+//! GNSS offset without a landmark, a clock error on a steady orbit) stays in every ellipse, and
+//! nothing averages out as if it were noise. Each fire is a function of those ([`Block`]), so the
+//! cost is linear in the fires. The camera is linearised about what is known at that moment, the
+//! clock error over its whole spread. The terrain's own error is a state of each fire, so that
+//! looking twice at the same ground does not make it better known.
 //!
-//! **Known limits.** A fire is a point with a size, not an area. The cost of a sighting is quadratic
-//! in the fires that are kept, so at most [`MAX_FIRES`] are.
+//! **Association.** Sightings and fires are matched in the image, all at once at the least total cost
+//! ([`assign`]); the distance holds the fire's own error and the common errors together.
+//!
+//! **Known limits.** A fire is a point with a size, not an area. Of what the wandering errors do to
+//! all fires alike, the part that the kept knots do not tell is lost (see [`Common`]).
+//! **Bound.** [`MAX_FIRES`] are kept; beyond, the suspected one with the least evidence goes.
 
+mod advice;
+mod assign;
+mod block;
+mod common;
 mod estimate;
-mod joint;
+mod glimpse;
 mod life;
+mod measure;
+mod pairs;
+mod shared_errors;
 
+pub use advice::{ADVISED, LookQuality, Outlook, advise};
+pub use assign::{Candidate, assign};
+pub use block::{Block, Chart};
+pub use common::{COMMON, Common, KNOTS};
 pub use estimate::Estimate;
-pub use joint::{Joint, MAX_FIRES};
 pub use life::Evidence;
+pub use shared_errors::{Estimated, SharedErrors};
 
 use crate::alarm::{AlarmClass, FireId, FireState, Method, SizeM};
-use crate::locate::{Fix, Sighting, Terrain, View, fix};
+use crate::locate::{Lens, Shared, Sighting, Terrain, View, fix};
 use emberfix_frames::{Coordinate, Covariance, Metres, MissionEnu, ServiceTime, Vector3};
+use estimate::Taken;
+use glimpse::Glimpse;
+use nalgebra::{DMatrix, DVector};
+use pairs::Pairs;
 use std::collections::BTreeSet;
 
 /// A sighting and what it is said to be.
@@ -45,12 +66,6 @@ pub struct TrackConfig {
     pub confirm_sightings: u32,
     /// Seconds that those sightings span at least.
     pub confirm_span_s: f64,
-    /// Seconds after which GNSS error has become another one.
-    pub gnss_correlation_s: f64,
-    /// Seconds after which heading error has become another one.
-    pub heading_correlation_s: f64,
-    /// Seconds after which boresight, disparity and clock errors have become other ones.
-    pub mount_correlation_s: f64,
     /// Seconds without a sighting after which a suspected fire is forgotten.
     pub forget_suspected_s: f64,
 }
@@ -60,9 +75,6 @@ impl Default for TrackConfig {
         Self {
             confirm_sightings: 8,
             confirm_span_s: 1.0,
-            gnss_correlation_s: 100.0,
-            heading_correlation_s: 300.0,
-            mount_correlation_s: 1800.0,
             forget_suspected_s: 20.0,
         }
     }
@@ -94,7 +106,6 @@ pub struct Fire {
     /// Number of the fire that this one turned out to be, if it did.
     pub merged_into: Option<FireId>,
     furthest_m: f64,
-    beside: BTreeSet<FireId>,
 }
 
 impl Fire {
@@ -121,17 +132,26 @@ impl Fire {
     pub fn methods(&self) -> Vec<Method> {
         self.estimate.methods()
     }
+
+    /// True when its position says where it is, and not only in which direction.
+    #[must_use]
+    pub fn is_located(&self) -> bool {
+        let (major_m, _, _) = self.covariance().horizontal_axes();
+        major_m <= (MAX_RELATIVE_SIGMA * self.range_m).max(NEAR_ENOUGH_M)
+    }
+
+    fn is_open(&self) -> bool {
+        self.merged_into.is_none()
+    }
 }
 
 /// What became of one sighting.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Outcome {
     /// Index in the frame's sightings.
     pub index: usize,
     /// The fire that it was given to, if any.
     pub fire: Option<FireId>,
-    /// Its own position, if it has one.
-    pub fix: Option<Fix>,
 }
 
 /// All fires of a mission.
@@ -140,19 +160,25 @@ pub struct Tracker {
     config: TrackConfig,
     fires: Vec<Fire>,
     next: FireId,
-    joint: Joint,
+    common: Common,
+    shared: Option<SharedErrors>,
+    pairs: Pairs,
     last_step: Option<ServiceTime>,
 }
 
-/// Chi-square 99.9 % for three degrees of freedom: bearing and disparity. A fire is sighted
-/// hundreds of times; at 99 % each orbit would throw some of its own sightings away.
-const GATE: f64 = 16.27;
-/// Chi-square 99 % for two: below it, two fires that were never seen side by side are one.
-const MERGE_GATE: f64 = 9.21;
+/// Fires at most.
+pub const MAX_FIRES: usize = 16_384;
 /// Room that is kept for the next frame's new fires.
-const ROOM: usize = 32;
+const ROOM: usize = 256;
+/// Largest horizontal sigma over range at which a fire is told.
+const MAX_RELATIVE_SIGMA: f64 = 0.3;
+/// Horizontal sigma that is good enough from however near, metres.
+const NEAR_ENOUGH_M: f64 = 5.0;
 /// A fire counts as missed from up to this many times the range that it was seen from.
 const MISS_REACH: f64 = 1.1;
+/// How far the clock error's spread is looked over, in its sigmas and at most, seconds.
+const CLOCK_SIGMAS: f64 = 1.75;
+const LOOK_AHEAD_S: f64 = 0.6;
 /// Smoke this close to a fire's pixel, in its own sizes, is that fire's smoke.
 const SMOKE_REACH: f64 = 0.6;
 
@@ -164,7 +190,9 @@ impl Tracker {
             config,
             fires: Vec::new(),
             next: first,
-            joint: Joint::default(),
+            common: Common::default(),
+            shared: None,
+            pairs: Pairs::default(),
             last_step: None,
         }
     }
@@ -175,10 +203,22 @@ impl Tracker {
         &self.fires
     }
 
-    /// Everything that is estimated: shared errors and fires, in the order of [`Tracker::fires`].
+    /// What is known of the errors that all fires share; `None` before the first frame.
     #[must_use]
-    pub fn joint(&self) -> &Joint {
-        &self.joint
+    pub fn shared_errors(&self) -> Option<&SharedErrors> {
+        self.shared.as_ref()
+    }
+
+    /// How far after a shutter the reported pose may have to be known, seconds: where the clock error
+    /// may lie, as far as it is known.
+    #[must_use]
+    pub fn looks_ahead_s(&self) -> f64 {
+        let ahead =
+            |shared: &SharedErrors| CLOCK_SIGMAS * shared.clock_s.sigma - shared.clock_s.value;
+        self.shared
+            .as_ref()
+            .map_or(0.0, ahead)
+            .clamp(0.0, LOOK_AHEAD_S)
     }
 
     /// Takes one frame in. Sightings come back with the fire that they were given to.
@@ -188,99 +228,166 @@ impl Tracker {
         sightings: &[Classified],
         terrain: Option<&dyn Terrain>,
     ) -> Vec<Outcome> {
-        self.age(view.pose.at);
-        let assigned = self.associate(view, sightings);
-        let mut outcomes = Vec::with_capacity(sightings.len());
-        for (index, classified) in sightings.iter().enumerate() {
-            let own = fix(&classified.sighting, view, terrain);
-            let fire = match assigned[index] {
-                Some(slot) => Some(self.update(slot, classified, view, terrain)),
-                None if self.explained(view, sightings, index, &assigned) => None,
-                None => own
-                    .as_ref()
-                    .and_then(|own| self.initiate(classified, own, view, terrain)),
-            };
-            outcomes.push(Outcome {
-                index,
-                fire,
-                fix: own,
-            });
+        let now = view.pose.at;
+        self.age(view);
+        let lens = self.lens(view);
+        let glimpses = glimpse::all(&self.fires, &self.common, &lens, view.rig);
+        let slots = glimpse::associate(&glimpses, &self.fires, sightings, &lens, view);
+        self.update(&slots, sightings, &lens, view, terrain);
+        let new = self.initiate(&slots, sightings, view, terrain);
+        let seen: BTreeSet<usize> = slots.iter().chain(&new).copied().flatten().collect();
+        for (slot, fire) in self.fires.iter_mut().enumerate() {
+            fire.estimate
+                .read_off(&self.common, now, seen.contains(&slot));
         }
-        self.read_off();
-        self.note_side_by_side(&outcomes);
-        self.note_misses(view, &outcomes);
-        self.merge();
-        self.forget(view.pose.at);
+        self.note_sightings(&slots, &new, sightings, view);
+        self.note_misses(&seen, &glimpses, view);
+        let outcomes = self.outcomes(&slots, &new);
+        self.merge(&seen, &glimpses, now);
+        self.forget(now);
+        self.shared = Some(SharedErrors::read_off(&self.common, view));
         outcomes
     }
 
     /// Lets time pass since the last frame.
-    fn age(&mut self, now: ServiceTime) {
+    fn age(&mut self, view: &View<'_>) {
         let dt_s = self
             .last_step
-            .map_or(0.0, |last| (now - last).as_secs_f64());
-        self.last_step = Some(now);
-        self.joint.age(dt_s, &self.config);
-        self.read_off();
-    }
-
-    /// Every fire follows what was learned of the shared errors.
-    fn read_off(&mut self) {
-        for (slot, fire) in self.fires.iter_mut().enumerate() {
-            fire.estimate.read_off(&self.joint, slot);
+            .map_or(0.0, |last| (view.pose.at - last).as_secs_f64());
+        self.last_step = Some(view.pose.at);
+        for passage in self.common.age(dt_s, view.priors(), view.sigmas()) {
+            for fire in &mut self.fires {
+                fire.estimate.block_mut().carry(&passage);
+            }
         }
     }
 
-    /// Nearest fire in the Mahalanobis sense for each sighting, each fire at most once.
-    fn associate(&self, view: &View<'_>, sightings: &[Classified]) -> Vec<Option<usize>> {
-        let mut pairs = Vec::new();
+    /// The camera, as far as it is known.
+    fn lens(&self, view: &View<'_>) -> Lens {
+        let clock_sigma = self.common.sigma(Shared::Clock as usize);
+        view.lens(&self.common.now(), clock_sigma)
+    }
+
+    /// Known fires learn from their sightings, and the common errors from all of them.
+    fn update(
+        &mut self,
+        slots: &[Option<usize>],
+        sightings: &[Classified],
+        lens: &Lens,
+        view: &View<'_>,
+        terrain: Option<&dyn Terrain>,
+    ) {
+        let pairs = slots.iter().zip(sightings);
+        let taken = pairs.filter_map(|(slot, classified)| {
+            let slot = (*slot)?;
+            let estimate = &self.fires[slot].estimate;
+            let sighting = &classified.sighting;
+            let taken = estimate.take(sighting, lens, view, terrain, &self.common, None)?;
+            Some((slot, taken))
+        });
+        let taken: Vec<_> = taken.collect();
+        self.absorb(&taken, lens);
+    }
+
+    fn absorb(&mut self, taken: &[(usize, Taken)], lens: &Lens) {
+        let mean = self.common.mean().clone();
+        let (rows, residual) = stacked(taken);
+        for (slot, taken) in taken {
+            self.fires[*slot]
+                .estimate
+                .learn(taken, &mean, lens.centre());
+        }
+        self.common.update(&rows, &residual);
+    }
+
+    /// Sightings that no fire and no other sighting explains begin a fire each.
+    fn initiate(
+        &mut self,
+        slots: &[Option<usize>],
+        sightings: &[Classified],
+        view: &View<'_>,
+        terrain: Option<&dyn Terrain>,
+    ) -> Vec<Option<usize>> {
+        let mut new = vec![None; sightings.len()];
+        if slots.iter().all(Option::is_some) {
+            return new;
+        }
+        let lens = self.lens(view);
+        let mut all_taken = Vec::new();
         for (index, classified) in sightings.iter().enumerate() {
-            for (slot, fire) in self.fires.iter().enumerate() {
-                if fire.class != classified.class || fire.merged_into.is_some() {
-                    continue;
-                }
-                if let Some(distance) =
-                    fire.estimate
-                        .distance(&classified.sighting, view, &self.joint, slot)
-                    && distance < GATE
-                {
-                    pairs.push((distance, index, slot));
-                }
+            let is_free = slots[index].is_none()
+                && self.fires.len() < MAX_FIRES
+                && !self.is_explained(&lens, sightings, index, slots);
+            if !is_free {
+                continue;
+            }
+            if let Some((fire, taken)) = self.begin(classified, &lens, view, terrain) {
+                new[index] = Some(self.fires.len());
+                all_taken.push((self.fires.len(), taken));
+                self.fires.push(fire);
             }
         }
-        pairs.sort_by(|a, b| a.0.total_cmp(&b.0));
-        let mut assigned = vec![None; sightings.len()];
-        let mut taken = BTreeSet::new();
-        for (_, index, slot) in pairs {
-            if assigned[index].is_none() && taken.insert(slot) {
-                assigned[index] = Some(slot);
-            }
-        }
-        assigned
+        self.absorb(&all_taken, &lens);
+        new
+    }
+
+    fn begin(
+        &mut self,
+        classified: &Classified,
+        lens: &Lens,
+        view: &View<'_>,
+        terrain: Option<&dyn Terrain>,
+    ) -> Option<(Fire, Taken)> {
+        let sighting = &classified.sighting;
+        let fix = fix(sighting, view, terrain);
+        let terrain_sigma = match (terrain, &fix) {
+            (Some(terrain), Some(fix)) => terrain.sigma_m(&fix.place),
+            (Some(terrain), None) => terrain.sigma_m(&view.pose.place),
+            (None, _) => 0.0,
+        };
+        let estimate = Estimate::unseen(sighting, lens, terrain_sigma, &self.common);
+        let taken = estimate.take(sighting, lens, view, terrain, &self.common, fix.as_ref())?;
+        let id = self.next;
+        self.next = FireId(id.0.saturating_add(1));
+        let fire = Fire {
+            id,
+            class: classified.class,
+            state: FireState::Suspected,
+            estimate,
+            evidence: Evidence::default(),
+            first_seen: sighting.at,
+            last_seen: sighting.at,
+            range_m: 0.0,
+            size_m: None,
+            flicker: crate::assess::Flicker::default(),
+            merged_into: None,
+            furthest_m: 0.0,
+        };
+        Some((fire, taken))
     }
 
     /// A sighting that another one of the frame, or a fire, already explains.
-    fn explained(
+    fn is_explained(
         &self,
-        view: &View<'_>,
+        lens: &Lens,
         sightings: &[Classified],
         index: usize,
-        assigned: &[Option<usize>],
+        slots: &[Option<usize>],
     ) -> bool {
         let this = &sightings[index];
         let nested = |other: usize| {
             other != index
                 && sightings[other].class == this.class
-                && (assigned[other].is_some() || other < index)
+                && (slots[other].is_some() || other < index)
                 && contains(&sightings[other].sighting, &this.sighting)
         };
         (0..sightings.len()).any(nested)
-            || (this.class == AlarmClass::Smoke && self.is_smoke_of_a_fire(view, sightings, this))
+            || (this.class == AlarmClass::Smoke && self.is_smoke_of_a_fire(lens, sightings, this))
     }
 
     fn is_smoke_of_a_fire(
         &self,
-        view: &View<'_>,
+        lens: &Lens,
         sightings: &[Classified],
         smoke: &Classified,
     ) -> bool {
@@ -292,99 +399,44 @@ impl Tracker {
             .fires
             .iter()
             .filter(|fire| fire.class == AlarmClass::Fire && fire.state != FireState::Out)
-            .filter_map(|fire| view.predict(&fire.estimate.position_m()))
+            .filter_map(|fire| {
+                let state = fire.estimate.block().state(&self.common);
+                lens.predict(&fire.estimate.block().chart().distant(&state).0)
+            })
             .map(|predicted| (predicted.pixel.u, predicted.pixel.v));
         seen.chain(known)
             .any(|(u, v)| is_near_box(&smoke.sighting, u, v))
     }
 
-    fn update(
+    fn note_sightings(
         &mut self,
-        slot: usize,
-        classified: &Classified,
+        slots: &[Option<usize>],
+        new: &[Option<usize>],
+        sightings: &[Classified],
         view: &View<'_>,
-        terrain: Option<&dyn Terrain>,
-    ) -> FireId {
-        let fire = &mut self.fires[slot];
-        fire.estimate.read_off(&self.joint, slot);
-        fire.estimate
-            .update(&classified.sighting, view, terrain, &mut self.joint, slot);
-        fire.evidence.hit(classified.score);
-        fire.last_seen = classified.sighting.at;
-        note_extent(fire, &classified.sighting, view);
-        let span_s = (fire.last_seen - fire.first_seen).as_secs_f64();
-        let enough = fire.evidence.hits() >= self.config.confirm_sightings
-            && span_s >= self.config.confirm_span_s;
-        match fire.state {
-            FireState::Suspected
-                if enough
-                    && fire.evidence.is_convincing()
-                    && !fire.flicker.may_be_lamp(fire.size_m, fire.evidence.hits()) =>
-            {
-                fire.state = FireState::Confirmed;
+    ) {
+        for (index, classified) in sightings.iter().enumerate() {
+            if let Some(slot) = slots[index].or(new[index]) {
+                let fire = &mut self.fires[slot];
+                let azimuth = azimuth(&fire.estimate.position_m(), view);
+                let sighting = &classified.sighting;
+                fire.evidence.hit(sighting.at, azimuth, classified.score);
+                fire.last_seen = sighting.at;
+                note_extent(fire, sighting, view);
+                advance(fire, &self.config);
             }
-            FireState::Out if fire.evidence.is_convincing() => fire.state = FireState::Confirmed,
-            _ => {}
-        }
-        fire.id
-    }
-
-    fn initiate(
-        &mut self,
-        classified: &Classified,
-        own: &Fix,
-        view: &View<'_>,
-        terrain: Option<&dyn Terrain>,
-    ) -> Option<FireId> {
-        if self.fires.len() >= MAX_FIRES {
-            return None;
-        }
-        let (joint, slot) = (&mut self.joint, self.fires.len());
-        let sighting = &classified.sighting;
-        let mut estimate = Estimate::start(sighting, own, view, terrain, joint, slot)?;
-        estimate.refine(sighting, view, terrain, joint, slot);
-        let id = self.next;
-        self.next = FireId(id.0.saturating_add(1));
-        let mut fire = Fire {
-            id,
-            class: classified.class,
-            state: FireState::Suspected,
-            estimate,
-            evidence: Evidence::default(),
-            first_seen: classified.sighting.at,
-            last_seen: classified.sighting.at,
-            range_m: own.range_m,
-            size_m: None,
-            flicker: crate::assess::Flicker::default(),
-            merged_into: None,
-            furthest_m: own.range_m,
-            beside: BTreeSet::new(),
-        };
-        fire.evidence.hit(classified.score);
-        note_extent(&mut fire, &classified.sighting, view);
-        self.fires.push(fire);
-        Some(id)
-    }
-
-    fn note_side_by_side(&mut self, outcomes: &[Outcome]) {
-        let seen: BTreeSet<FireId> = outcomes.iter().filter_map(|outcome| outcome.fire).collect();
-        if seen.len() < 2 {
-            return;
-        }
-        for fire in self.fires.iter_mut().filter(|fire| seen.contains(&fire.id)) {
-            fire.beside.extend(seen.iter().filter(|id| **id != fire.id));
         }
     }
 
-    fn note_misses(&mut self, view: &View<'_>, outcomes: &[Outcome]) {
-        let seen: BTreeSet<FireId> = outcomes.iter().filter_map(|outcome| outcome.fire).collect();
-        for fire in self
-            .fires
-            .iter_mut()
-            .filter(|fire| !seen.contains(&fire.id))
+    fn note_misses(&mut self, seen: &BTreeSet<usize>, glimpses: &[Glimpse], view: &View<'_>) {
+        for glimpse in glimpses
+            .iter()
+            .filter(|glimpse| !seen.contains(&glimpse.slot))
         {
-            if should_be_seen(fire, view) {
-                fire.evidence.miss();
+            let fire = &mut self.fires[glimpse.slot];
+            if should_be_seen(fire, glimpse, view) {
+                let azimuth = azimuth(&fire.estimate.position_m(), view);
+                fire.evidence.miss(view.pose.at, azimuth);
                 if fire.is_confirmed() && fire.evidence.is_refuted() {
                     fire.state = FireState::Out;
                 }
@@ -392,58 +444,43 @@ impl Tracker {
         }
     }
 
-    /// Joins fires that were never seen side by side and whose difference is within its own error.
-    fn merge(&mut self) {
-        for younger in (1..self.fires.len()).rev() {
-            let elder = (0..younger).find(|elder| self.are_one(*elder, younger));
-            if let Some(elder) = elder {
-                let into = self.fires[elder].id;
-                self.fires[younger].merged_into = Some(into);
-                self.fires[younger].state = FireState::Out;
-            }
+    fn outcomes(&self, slots: &[Option<usize>], new: &[Option<usize>]) -> Vec<Outcome> {
+        let id = |slot: usize| self.fires.get(slot).map(|fire| fire.id);
+        slots
+            .iter()
+            .zip(new)
+            .enumerate()
+            .map(|(index, (slot, new))| Outcome {
+                index,
+                fire: slot.or(*new).and_then(id),
+            })
+            .collect()
+    }
+
+    /// Joins what looks have shown to be one fire (see [`Pairs`]).
+    fn merge(&mut self, seen: &BTreeSet<usize>, glimpses: &[Glimpse], now: ServiceTime) {
+        let ones = self
+            .pairs
+            .look(&self.fires, glimpses, seen, &self.common, now);
+        for (elder, younger) in ones {
+            let into = self.fires[elder].id;
+            self.fires[younger].merged_into = Some(into);
+            self.fires[younger].state = FireState::Out;
         }
-    }
-
-    fn are_one(&self, elder: usize, younger: usize) -> bool {
-        let (a, b) = (&self.fires[elder], &self.fires[younger]);
-        let open = |fire: &Fire| fire.merged_into.is_none() && fire.state != FireState::Out;
-        a.class == b.class
-            && open(a)
-            && open(b)
-            && !a.beside.contains(&b.id)
-            && self.distance_between(elder, younger) < MERGE_GATE
-    }
-
-    /// Squared Mahalanobis distance, horizontal, between two fires. They have the shared errors in
-    /// common, and their own extent: two boxes on one wide fire need not have the same base.
-    fn distance_between(&self, a: usize, b: usize) -> f64 {
-        let joint = &self.joint;
-        let common = joint.between(a, b);
-        let spread = joint.between(a, a) + joint.between(b, b) - common - common.transpose();
-        let extent_m = extent_m(&self.fires[a]).max(extent_m(&self.fires[b]));
-        let extent = nalgebra::Matrix2::identity() * (0.25 * extent_m * extent_m);
-        let spread = spread.fixed_view::<2, 2>(0, 0) + extent;
-        let apart = (joint.fire(a) - joint.fire(b))
-            .fixed_rows::<2>(0)
-            .into_owned();
-        spread
-            .cholesky()
-            .map_or(f64::INFINITY, |spread| apart.dot(&spread.solve(&apart)))
     }
 
     fn forget(&mut self, now: ServiceTime) {
         let limit_s = self.config.forget_suspected_s;
-        let merged_early =
-            |fire: &Fire| fire.merged_into.is_some() && !fire.evidence.was_convincing();
-        let over = |fire: &Fire| {
+        let goes = |fire: &Fire| {
             let age_s = (now - fire.last_seen).as_secs_f64();
-            fire.state == FireState::Suspected && (age_s > limit_s || fire.evidence.is_refuted())
+            let merged_early = !fire.is_open() && !fire.evidence.was_convincing();
+            let over = fire.state == FireState::Suspected
+                && (age_s > limit_s || fire.evidence.is_refuted());
+            merged_early || over
         };
-        for slot in (0..self.fires.len()).rev() {
-            let fire = &self.fires[slot];
-            if over(fire) || merged_early(fire) {
-                self.remove(slot);
-            }
+        if self.fires.iter().any(goes) {
+            self.fires.retain(|fire| !goes(fire));
+            self.pairs.keep_only(&self.fires);
         }
         while self.fires.len() > MAX_FIRES - ROOM && self.forget_weakest().is_some() {}
     }
@@ -458,18 +495,49 @@ impl Tracker {
         let probability = |fire: &Fire| fire.evidence.probability();
         let weakest = suspected.min_by(|a, b| probability(a.1).total_cmp(&probability(b.1)));
         let slot = weakest.map(|(slot, _)| slot)?;
-        self.remove(slot);
-        Some(())
-    }
-
-    fn remove(&mut self, slot: usize) {
         self.fires.remove(slot);
-        self.joint.remove(slot);
+        Some(())
     }
 }
 
-fn extent_m(fire: &Fire) -> f64 {
-    fire.size_m.map_or(0.0, |size| size.width)
+/// All rows that say something of the common errors, each with unit noise.
+fn stacked(taken: &[(usize, Taken)]) -> (DMatrix<f64>, DVector<f64>) {
+    let mut rows = DMatrix::zeros(taken.len() * block::MEASURED, COMMON);
+    let mut residual = DVector::zeros(taken.len() * block::MEASURED);
+    for (index, (_, taken)) in taken.iter().enumerate() {
+        let (from, told) = (index * block::MEASURED, &taken.told);
+        rows.fixed_rows_mut::<{ block::MEASURED }>(from)
+            .copy_from(&(told.whitener * told.rows));
+        residual
+            .fixed_rows_mut::<{ block::MEASURED }>(from)
+            .copy_from(&(told.whitener * told.residual));
+    }
+    (rows, residual)
+}
+
+/// Suspected to confirmed, and back from out, by what was seen.
+fn advance(fire: &mut Fire, config: &TrackConfig) {
+    let span_s = (fire.last_seen - fire.first_seen).as_secs_f64();
+    let enough =
+        fire.evidence.hits() >= config.confirm_sightings && span_s >= config.confirm_span_s;
+    match fire.state {
+        FireState::Suspected
+            if enough
+                && fire.evidence.is_convincing()
+                && fire.is_located()
+                && !fire.flicker.may_be_lamp(fire.size_m, fire.evidence.hits()) =>
+        {
+            fire.state = FireState::Confirmed;
+        }
+        FireState::Out if fire.evidence.is_convincing() => fire.state = FireState::Confirmed,
+        _ => {}
+    }
+}
+
+/// Azimuth of a point from the camera, radians clockwise from north.
+fn azimuth(point: &Vector3<f64>, view: &View<'_>) -> f64 {
+    let sight = point - view.camera_enu;
+    sight.x.atan2(sight.y)
 }
 
 fn note_extent(fire: &mut Fire, sighting: &Sighting, view: &View<'_>) {
@@ -485,19 +553,15 @@ fn note_extent(fire: &mut Fire, sighting: &Sighting, view: &View<'_>) {
 }
 
 /// In the image with a margin, and hardly further than it has been seen from.
-fn should_be_seen(fire: &Fire, view: &View<'_>) -> bool {
-    let position = fire.estimate.position_m();
-    let Some(predicted) = view.predict(&position) else {
-        return false;
-    };
+fn should_be_seen(fire: &Fire, glimpse: &Glimpse, view: &View<'_>) -> bool {
     let (width, height) = view.rig.camera(emberfix_calib::Eye::Left).image_size_px;
     let inside = |value: f64, size: u32| {
         let margin = 0.08 * f64::from(size);
         (margin..f64::from(size) - margin).contains(&value)
     };
-    inside(predicted.pixel.u, width)
-        && inside(predicted.pixel.v, height)
-        && (position - view.camera_enu).norm() <= MISS_REACH * fire.furthest_m
+    inside(glimpse.seen.x, width)
+        && inside(glimpse.seen.y, height)
+        && (fire.estimate.position_m() - view.camera_enu).norm() <= MISS_REACH * fire.furthest_m
 }
 
 /// True when `outer` holds most of `inner`.

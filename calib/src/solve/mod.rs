@@ -7,12 +7,11 @@
 //!
 //! **Assumptions.** A flat board; corner errors independent of each other, with one sigma an eye,
 //! which the residuals tell. Where whole views disagree by more than that (a bent board, eyes out of
-//! step), a jackknife over views says so and [`StereoSolution::covariance`] is widened by its factor.
-//! **Known limits.** Every view needs the board in both eyes.
+//! step), a jackknife over views widens [`StereoSolution::covariance`], each parameter by its own factor.
+//! **Known limits.** Every view needs the whole chessboard in both eyes; no ChArUco.
 
 mod board;
-mod charuco;
-mod dictionary;
+mod calibration;
 mod find;
 mod joint;
 mod predict;
@@ -20,7 +19,11 @@ mod project;
 mod start;
 mod trust;
 
-pub use board::{Board, BoardError, BoardKind};
+pub use board::{Board, BoardError};
+pub use calibration::{
+    COVERAGE_CELLS, Calibration, Demands, TOLD_DEPTHS_M, calibrate, cell, epipolar_rms_px,
+    rectification,
+};
 pub use find::{find_corners, make_consistent, read_grey};
 pub use joint::{BoardPose, GLOBALS, GlobalMatrix, GlobalVector, parameter_names};
 pub use predict::{RangeError, disparity_sigma_px, range_errors};
@@ -105,7 +108,7 @@ pub struct StereoSolution {
     pub covariance: GlobalMatrix,
     /// One sigma of a corner along one axis, pixels: left eye, right eye.
     pub corner_sigma_px: [f64; 2],
-    /// By how much sigmas were widened because whole views disagree; 1 when they don't.
+    /// The most by which a parameter's sigma was widened because whole views disagree; 1 when they don't.
     pub widened_by: f64,
     /// What is left of every view.
     pub residuals: Vec<ViewResiduals>,
@@ -131,6 +134,12 @@ impl StereoSolution {
         let along = self.translation_m.normalize();
         let block = self.covariance.fixed_view::<3, 3>(21, 21);
         (along.transpose() * block * along)[0].max(0.0).sqrt()
+    }
+
+    /// Every shared parameter, in the order of [`parameter_names`]; the rotation as a vector.
+    #[must_use]
+    pub fn values(&self) -> GlobalVector {
+        joint::values(self)
     }
 
     /// One sigma of every parameter, in the order of [`parameter_names`].

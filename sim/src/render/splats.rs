@@ -34,8 +34,18 @@ pub(super) struct SeenSplat {
 
 impl SeenSplat {
     pub(super) fn new(splat: &Splat, pose: &EyePose, lens: &Lens) -> Option<Self> {
+        Self::beyond(NEAREST_M, splat, pose, lens)
+    }
+
+    /// A splat, if all of it is beyond `nearest_m` of depth.
+    pub(super) fn beyond(
+        nearest_m: f64,
+        splat: &Splat,
+        pose: &EyePose,
+        lens: &Lens,
+    ) -> Option<Self> {
         let centre = pose.see(&splat.centre_m);
-        if centre.z < NEAREST_M + splat.half_width_m {
+        if centre.z < nearest_m + splat.half_width_m {
             return None;
         }
         let middle = lens.project(&centre)?;

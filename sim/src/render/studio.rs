@@ -158,6 +158,8 @@ pub struct Seen {
     pub box_px: [f64; 4],
     /// Mean over these pixels of the reciprocal depth of their flame light, 1/m, along `axis`.
     pub inverse_depth_per_m: f64,
+    /// Mean row of these pixels, raw left image.
+    pub row: f64,
     /// How many pixels.
     pub pixels: usize,
     /// Share of them whose red is saturated.
@@ -166,11 +168,13 @@ pub struct Seen {
 
 /// Flame light from which a pixel counts as flame: clearly brighter than a sunlit meadow.
 const LIT: f32 = 0.22;
+/// Nothing nearer is drawn, metres of depth.
+const NEAREST_M: f64 = 0.05;
 /// Flames are drawn this fine, hi-resolution pixels of height.
-const FINE_PX: f64 = 240.0;
+const FINE_PX: f64 = 200.0;
 const FINEST: usize = 8;
 /// Surroundings that are drawn, pixels: context and search of any matcher.
-const AROUND_PX: (usize, usize) = (160, 64);
+const AROUND_PX: (usize, usize) = (160, 48);
 /// Light outside of what is drawn.
 const UNDRAWN: u8 = 60;
 /// Sigma of the wide glow in a lens, pixels.
@@ -234,56 +238,40 @@ impl Studio {
     pub fn expose(&self, shot: &Shot, eye: Eye, look: &Look) -> Frame {
         let view = self.view(shot, eye, look);
         let layer = self.layer(shot, &view, None);
+        self.developed(shot, &view, &layer)
+    }
+
+    /// The left eye's raw image and what it truly sees of the first flame; depth counts along `axis`
+    /// (east, north, up; of unit length) from the left eye. `None` when the flame lights no pixel.
+    #[must_use]
+    pub fn expose_left(
+        &self,
+        shot: &Shot,
+        look: &Look,
+        axis: &Vector3<f64>,
+    ) -> (Frame, Option<Seen>) {
+        let view = self.view(shot, Eye::Left, look);
+        let layer = self.layer(shot, &view, Some(axis));
+        let seen = layer.seen(look.gain as f32);
+        (self.developed(shot, &view, &layer), seen)
+    }
+
+    fn developed(&self, shot: &Shot, view: &View, layer: &Layer) -> Frame {
         let (width, height) = (view.lens.width, view.lens.height);
-        let channels = if eye == Eye::Left { 3 } else { 1 };
+        let (channels, format) = match view.eye {
+            Eye::Left => (3, PixelFormat::Bgr8),
+            Eye::Right => (1, PixelFormat::Mono8),
+        };
         let mut bytes = vec![UNDRAWN; width * height * channels];
         let drawn = layer.extent.grown(AROUND_PX, view.lens);
-        let light = self.light(shot, &view, &layer, &drawn);
-        develop(&light, &drawn, &view, channels, &mut bytes);
-        let format = if channels == 3 {
-            PixelFormat::Bgr8
-        } else {
-            PixelFormat::Mono8
-        };
+        let light = self.light(shot, view, layer, &drawn);
+        develop(&light, &drawn, view, channels, &mut bytes);
         Frame {
             width: width as u32,
             height: height as u32,
             format,
             bytes,
         }
-    }
-
-    /// What the left eye truly sees of the first flame; depth counts along `axis` (east, north, up;
-    /// of unit length) from the left eye. `None` when it lights no pixel.
-    #[must_use]
-    pub fn seen(&self, shot: &Shot, look: &Look, axis: &Vector3<f64>) -> Option<Seen> {
-        let view = self.view(shot, Eye::Left, look);
-        let layer = self.layer(shot, &view, Some(axis));
-        let (mut sum, mut pixels, mut saturated) = (0.0, 0usize, 0usize);
-        let mut reach = [usize::MAX, usize::MAX, 0, 0];
-        for (index, lanes) in layer.pixels.iter().enumerate() {
-            let gain = look.gain as f32;
-            if lanes[4] * gain < LIT {
-                continue;
-            }
-            let (column, row) = layer.extent.place(index);
-            reach = [
-                reach[0].min(column),
-                reach[1].min(row),
-                reach[2].max(column),
-                reach[3].max(row),
-            ];
-            sum += f64::from(lanes[5] / lanes[4]);
-            pixels += 1;
-            saturated += usize::from(lanes[0] * gain > 1.0);
-        }
-        let [left, top, right, bottom] = reach.map(|edge| edge as f64);
-        (pixels > 0).then(|| Seen {
-            box_px: [left, top, right + 1.0, bottom + 1.0],
-            inverse_depth_per_m: sum / pixels as f64,
-            pixels,
-            saturated: saturated as f64 / pixels as f64,
-        })
     }
 
     fn view<'a>(&'a self, shot: &Shot, eye: Eye, look: &'a Look) -> View<'a> {
@@ -409,7 +397,7 @@ impl View<'_> {
                 splat.opacity *= 0.6;
             }
         }
-        let seen = SeenSplat::new(&splat, &self.pose, lens)?;
+        let seen = SeenSplat::beyond(NEAREST_M, &splat, &self.pose, lens)?;
         let inverse_depth =
             axis.map(|axis| (1.0 / (splat.centre_m - self.pose.origin_m).dot(axis)) as f32);
         let seen_px = seen.across_per_px();
@@ -458,6 +446,36 @@ fn averaged(lanes: &[Lanes], columns: usize, fineness: usize) -> Vec<Lanes> {
 }
 
 impl Layer {
+    /// What stands in it of the target.
+    fn seen(&self, gain: f32) -> Option<Seen> {
+        let (mut sum, mut rows, mut pixels, mut saturated) = (0.0, 0.0, 0usize, 0usize);
+        let mut reach = [usize::MAX, usize::MAX, 0, 0];
+        for (index, lanes) in self.pixels.iter().enumerate() {
+            if lanes[4] * gain < LIT {
+                continue;
+            }
+            let (column, row) = self.extent.place(index);
+            reach = [
+                reach[0].min(column),
+                reach[1].min(row),
+                reach[2].max(column),
+                reach[3].max(row),
+            ];
+            sum += f64::from(lanes[5] / lanes[4]);
+            rows += row as f64;
+            pixels += 1;
+            saturated += usize::from(lanes[0] * gain > 1.0);
+        }
+        let [left, top, right, bottom] = reach.map(|edge| edge as f64);
+        (pixels > 0).then(|| Seen {
+            box_px: [left, top, right + 1.0, bottom + 1.0],
+            inverse_depth_per_m: sum / pixels as f64,
+            row: rows / pixels as f64,
+            pixels,
+            saturated: saturated as f64 / pixels as f64,
+        })
+    }
+
     fn at(&self, column: usize, row: usize) -> Option<Lanes> {
         let extent = &self.extent;
         let inside = (extent.left..extent.right).contains(&column)
@@ -657,7 +675,12 @@ impl<'a> BackdropView<'a> {
             let plants = 1.6 * green - red;
             return [(0.12 + 1.5 * plants.max(0.0)) * (1.7 - 0.7 * middle) * (0.6 + 0.4 * fine); 3];
         }
-        [red, green, blue].map(|c| c * middle * fine)
+        let colour = match self.shot.backdrop {
+            // Rooms are plastered, not turfed.
+            Backdrop::Wall { .. } => [(red + green + blue) / 3.0; 3],
+            Backdrop::Ground { .. } => [red, green, blue],
+        };
+        colour.map(|c| c * middle * fine)
     }
 }
 
@@ -676,31 +699,47 @@ fn blurred(light: Vec<[f32; 3]>, columns: usize, look: &Look) -> Vec<[f32; 3]> {
 }
 
 fn gaussian(light: &[[f32; 3]], columns: usize, sigma_px: f64) -> Vec<[f32; 3]> {
-    let reach = (3.0 * sigma_px).ceil() as isize;
-    let weights: Vec<f32> = (-reach..=reach)
-        .map(|k| (-0.5 * (k as f64 / sigma_px).powi(2)).exp() as f32)
-        .collect();
+    let reach = (3.0 * sigma_px).ceil() as usize;
+    let weight = |k: usize| (-0.5 * ((k as f64 - reach as f64) / sigma_px).powi(2)).exp() as f32;
+    let weights: Vec<f32> = (0..=2 * reach).map(weight).collect();
     let total: f32 = weights.iter().sum();
-    let rows = (light.len() / columns) as isize;
-    let pass = |from: &[[f32; 3]], step: (isize, isize)| -> Vec<[f32; 3]> {
-        let mut to = Vec::with_capacity(from.len());
-        for row in 0..rows {
-            for column in 0..columns as isize {
-                let mut sum = [0.0; 3];
-                for (k, weight) in (-reach..=reach).zip(&weights) {
-                    let x = (column + k * step.0).clamp(0, columns as isize - 1);
-                    let y = (row + k * step.1).clamp(0, rows - 1);
-                    let pixel = from[y as usize * columns + x as usize];
-                    for (s, p) in sum.iter_mut().zip(pixel) {
-                        *s += weight * p;
-                    }
-                }
-                to.push(sum.map(|s| s / total));
+    let weights: Vec<f32> = weights.iter().map(|weight| weight / total).collect();
+    let across: Vec<[f32; 3]> = light
+        .chunks_exact(columns)
+        .flat_map(|line| smoothed(line, &weights))
+        .collect();
+    transposed(
+        &transposed(&across, columns)
+            .chunks_exact(light.len() / columns)
+            .flat_map(|line| smoothed(line, &weights))
+            .collect::<Vec<_>>(),
+        light.len() / columns,
+    )
+}
+
+/// One line, its ends repeated, under the weights.
+fn smoothed(line: &[[f32; 3]], weights: &[f32]) -> Vec<[f32; 3]> {
+    let reach = weights.len() / 2;
+    let (first, last) = (line[0], line[line.len() - 1]);
+    let mut padded = vec![first; reach];
+    padded.extend_from_slice(line);
+    padded.resize(line.len() + 2 * reach, last);
+    let sum = |window: &[[f32; 3]]| {
+        let mut sum = [0.0; 3];
+        for (pixel, weight) in window.iter().zip(weights) {
+            for (s, p) in sum.iter_mut().zip(pixel) {
+                *s += weight * p;
             }
         }
-        to
+        sum
     };
-    pass(&pass(light, (1, 0)), (0, 1))
+    padded.windows(weights.len()).map(sum).collect()
+}
+
+fn transposed(light: &[[f32; 3]], columns: usize) -> Vec<[f32; 3]> {
+    let rows = light.len() / columns;
+    let at = |index: usize| light[index % rows * columns + index / rows];
+    (0..light.len()).map(at).collect()
 }
 
 /// Light to bytes.
@@ -751,5 +790,110 @@ impl RayGrid {
             (a * (1.0 - x) + b * x) * (1.0 - y) + (c * (1.0 - x) + d * x) * y
         };
         (between(a.0, b.0, c.0, d.0), between(a.1, b.1, c.1, d.1))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::world::WorldConfig;
+    use emberfix_calib::Rig;
+    use nalgebra::Matrix3;
+    use std::path::Path;
+
+    fn studio() -> Studio {
+        let rig = Rig::parse(
+            include_str!("../../../calib/rigs/oakd-75mm.toml"),
+            Path::new("oakd-75mm"),
+        )
+        .unwrap();
+        let world = World::new(&WorldConfig::default(), 1).unwrap();
+        Studio::new(Arc::new(world), StereoCamera::new(&rig))
+    }
+
+    /// A flame 8 m ahead and 4.6 m down, where the camera looks.
+    fn shot() -> Shot {
+        Shot {
+            body: BodyState {
+                t_s: 0.0,
+                position_m: Vector3::zeros(),
+                enu_from_body: Matrix3::new(0.0, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, -1.0),
+                velocity_m_s: Vector3::zeros(),
+                rate_rad_s: Vector3::zeros(),
+            },
+            t_s: 9.0,
+            fires: vec![StudioFire {
+                seed: 4,
+                base_m: Vector3::new(0.0, 8.0, -5.2),
+                width_m: 0.7,
+                height_m: 1.1,
+                wind_m_s: Vector2::zeros(),
+            }],
+            backdrop: Backdrop::Ground { up_m: -5.2 },
+            daylight: 0.2,
+            branches: Vec::new(),
+            puffs: Vec::new(),
+        }
+    }
+
+    fn look() -> Look {
+        Look {
+            skew_s: 0.0,
+            gain: 1.0,
+            blur_px: 0.6,
+            glare: 0.0,
+            noise_sigma_dn: 2.0,
+            near_infrared: false,
+            dirt: Vec::new(),
+            seed: 1,
+        }
+    }
+
+    #[test]
+    fn the_depth_that_is_seen_is_within_the_flame() {
+        let (sin, cos) = 30.0_f64.to_radians().sin_cos();
+        let axis = Vector3::new(0.0, cos, -sin);
+        let (_, seen) = studio().expose_left(&shot(), &look(), &axis);
+        let seen = seen.unwrap();
+        // The lever arm puts the eye 0.12 m ahead and 0.06 m down of the body.
+        let base = Vector3::new(0.0, 8.0 - 0.12, -5.2 + 0.06).dot(&axis);
+        let (near, far) = (base - 1.1 * sin - 0.4, base + 0.4);
+        let depth = 1.0 / seen.inverse_depth_per_m;
+        assert!((near..far).contains(&depth), "{depth} m of {near} to {far}");
+        assert!(seen.pixels > 500, "{}", seen.pixels);
+    }
+
+    #[test]
+    fn a_later_exposure_shows_another_flame_and_a_gain_another_brightness() {
+        let (studio, shot) = (studio(), shot());
+        let bytes = |look: &Look| studio.expose(&shot, Eye::Right, look).bytes;
+        let first = bytes(&look());
+        assert_eq!(first, bytes(&look()));
+        let later = Look {
+            skew_s: 0.02,
+            ..look()
+        };
+        assert_ne!(first, bytes(&later));
+        let sum = |bytes: &[u8]| bytes.iter().map(|b| u64::from(*b)).sum::<u64>();
+        let dimmer = Look {
+            gain: 0.5,
+            ..look()
+        };
+        assert!(sum(&bytes(&dimmer)) < sum(&first));
+    }
+
+    #[test]
+    fn what_lives_in_one_eye_is_not_in_the_other() {
+        let (studio, mut lit) = (studio(), shot());
+        lit.puffs.push(Puff {
+            centre_m: Vector3::new(0.0, 7.8, -4.9),
+            radius_m: 0.2,
+            kind: PuffKind::Light { strength: 3.0 },
+            only: Some(Eye::Right),
+        });
+        let same = |eye| {
+            studio.expose(&shot(), eye, &look()).bytes == studio.expose(&lit, eye, &look()).bytes
+        };
+        assert!(same(Eye::Left) && !same(Eye::Right));
     }
 }

@@ -14,6 +14,8 @@ pub struct WorldConfig {
     pub ground: Vec<GroundCover>,
     /// Flames.
     pub fires: Vec<FireConfig>,
+    /// Fires that run over the ground.
+    pub spreads: Vec<SpreadConfig>,
     /// Smoke without a visible flame.
     pub smokes: Vec<SmokeConfig>,
     /// Things that a detector takes for fire.
@@ -35,6 +37,7 @@ impl Default for WorldConfig {
             terrain_up_m: 0.0,
             ground: vec![GroundCover::Grass, GroundCover::Soil],
             fires: Vec::new(),
+            spreads: Vec::new(),
             smokes: Vec::new(),
             lookalikes: Vec::new(),
             boards: Vec::new(),
@@ -107,6 +110,39 @@ pub struct FireConfig {
     /// How fast the height grows; the width keeps its proportion.
     #[serde(default)]
     pub growth_m_s: f64,
+}
+
+/// How a flame of `fires` runs over the ground; without it, a flame stays where it is.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SpreadConfig {
+    /// Name of the fire.
+    pub fire: String,
+    /// Where its head runs to, clockwise from north.
+    pub azimuth_deg: f64,
+    /// Speed of the head.
+    pub speed_m_s: f64,
+    /// Speed of the flanks, as a share of the head's.
+    #[serde(default = "usual_flank")]
+    pub flank: f64,
+    /// Speed of the back, as a share of the head's.
+    #[serde(default = "usual_back")]
+    pub back: f64,
+    /// How long a place burns.
+    #[serde(default = "usual_residence_s")]
+    pub residence_s: f64,
+}
+
+fn usual_flank() -> f64 {
+    0.4
+}
+
+fn usual_back() -> f64 {
+    0.1
+}
+
+fn usual_residence_s() -> f64 {
+    30.0
 }
 
 /// Smoke without a visible flame.

@@ -12,14 +12,17 @@
 
 mod burning;
 mod config;
+mod spread;
 mod terrain;
 mod texture;
 mod things;
 
 pub use config::{
     BoardConfig, FireConfig, GroundCover, LightConfig, LookalikeConfig, LookalikeKind, SmokeConfig,
-    TerrainConfig, TreesConfig, WindConfig, WorldConfig,
+    SpreadConfig, TerrainConfig, TreesConfig, WindConfig, WorldConfig,
 };
+
+pub use spread::Spread;
 
 pub(crate) use burning::{Flame, Plume, Splat, SplatKind, unit};
 pub(crate) use terrain::Terrain;
@@ -59,6 +62,8 @@ pub struct FireTruth {
     pub growth_m_s: f64,
     /// Whether a plume rises from a flame.
     pub smokes: bool,
+    /// How it runs over the ground, if it does.
+    pub spread: Option<Spread>,
 }
 
 impl FireTruth {
@@ -85,6 +90,12 @@ pub enum WorldError {
         low: f64,
         /// Greatest allowed.
         high: f64,
+    },
+    /// A spread of a fire that is not there.
+    #[error("sim.world.spreads: no fire is named {name:?}")]
+    NoSuchFire {
+        /// The name.
+        name: String,
     },
     /// Two fires or smokes of one name.
     #[error("sim.world: two fires are named {name:?}; names tell truth from truth")]
@@ -115,6 +126,11 @@ pub(crate) struct Burning {
     pub class: BurningClass,
     pub splats: Vec<Splat>,
 }
+
+/// Moments that a reach is averaged over.
+const REACH_TIMES: u32 = 9;
+/// Share of a splat's half width at which its kernel `(1 - r²)²` is a half.
+const HALF_DENSE: f64 = 0.541;
 
 /// Light that a flame throws on the ground.
 #[derive(Debug, Clone, Copy)]
@@ -160,6 +176,42 @@ impl World {
         &self.fires
     }
 
+    /// How far the visible flame of a fire reaches from its base in a direction (unit vector; east,
+    /// north, up) about a time, metres: the mean over two seconds before and after, as flames lick.
+    /// Flame ends where a cloud is half as dense as in its middle. `None` for what is no flame then.
+    #[must_use]
+    pub fn flame_reach_m(&self, fire: usize, direction: &Vector3<f64>, t_s: f64) -> Option<f64> {
+        let base_m = self.fires.get(fire)?.base_m;
+        let mut sum = 0.0;
+        for k in 0..REACH_TIMES {
+            let off_s = 4.0 * (f64::from(k) / f64::from(REACH_TIMES - 1) - 0.5);
+            let splats = self.flame_splats(fire, t_s + off_s)?;
+            let reaches = splats.iter().map(|splat| {
+                let half = splat.half_axis_m.dot(direction).hypot(splat.half_width_m);
+                (splat.centre_m - base_m).dot(direction) + HALF_DENSE * half
+            });
+            sum += reaches.fold(f64::NEG_INFINITY, f64::max);
+        }
+        Some(sum / f64::from(REACH_TIMES))
+    }
+
+    /// Light of all flames from a place: face in m² times flicker over the squared range.
+    #[must_use]
+    pub fn flame_light(&self, from_m: &Vector3<f64>, t_s: f64) -> f64 {
+        let light = |fire: usize| {
+            let flame = self.flame(fire, t_s)?;
+            let truth = &self.fires[fire];
+            let age_s = t_s - truth.ignites_at_s;
+            let sites = truth.spread.map_or(1, |spread| {
+                spread.sites(flame.seed, flame.width_m, age_s).len()
+            });
+            let face_m2 = sites as f64 * flame.width_m * flame.height_m;
+            let range2_m2 = (flame.base_m - from_m).norm_squared().max(1.0);
+            Some(face_m2 * flame.flicker() * flame.temper() / range2_m2)
+        };
+        (0..self.fires.len()).filter_map(light).sum()
+    }
+
     pub(crate) fn terrain(&self) -> &Terrain {
         &self.terrain
     }
@@ -189,8 +241,7 @@ impl World {
     pub(crate) fn burning(&self, t_s: f64) -> Vec<Burning> {
         let mut clouds = Vec::new();
         for (fire, truth) in self.fires.iter().enumerate() {
-            if let Some(flame) = self.flame(fire, t_s) {
-                let splats = flame.splats();
+            if let Some(splats) = self.flame_splats(fire, t_s) {
                 clouds.push(Burning {
                     fire,
                     class: BurningClass::Fire,
@@ -236,6 +287,32 @@ impl World {
             wind_m_s,
             t_s,
         })
+    }
+
+    /// One flame, or one at each place that a running fire burns at.
+    fn flame_splats(&self, fire: usize, t_s: f64) -> Option<Vec<Splat>> {
+        let flame = self.flame(fire, t_s)?;
+        let truth = &self.fires[fire];
+        let Some(spread) = truth.spread else {
+            return Some(flame.splats());
+        };
+        let sites = spread.sites(flame.seed, flame.width_m, t_s - truth.ignites_at_s);
+        let splats = sites.iter().enumerate().flat_map(|(k, site)| {
+            let foot = flame.base_m.xy() + site;
+            Flame {
+                // A flame of the front goes with it, a site keeps its own while others come and go.
+                seed: if k < Spread::FRONT {
+                    hash(flame.seed, k as u32, 0xF07)
+                } else {
+                    let cell = [site.x, site.y].map(|metres| (metres * 64.0) as i32 as u32);
+                    hash(flame.seed, cell[0], cell[1])
+                },
+                base_m: Vector3::new(foot.x, foot.y, self.ground_up_m(foot.x, foot.y)),
+                ..flame
+            }
+            .splats()
+        });
+        Some(splats.collect())
     }
 
     fn plume(&self, fire: usize, truth: &FireTruth, t_s: f64) -> Option<Plume> {
@@ -370,6 +447,11 @@ fn truths(config: &WorldConfig, terrain: &Terrain) -> Vec<FireTruth> {
         ignites_at_s: fire.ignites_at_s,
         growth_m_s: fire.growth_m_s,
         smokes: fire.smoke,
+        spread: config
+            .spreads
+            .iter()
+            .find(|spread| spread.fire == fire.name)
+            .map(Spread::new),
     });
     let smokes = config.smokes.iter().map(|smoke| FireTruth {
         name: smoke.name.clone(),
@@ -380,6 +462,7 @@ fn truths(config: &WorldConfig, terrain: &Terrain) -> Vec<FireTruth> {
         ignites_at_s: smoke.ignites_at_s,
         growth_m_s: 0.0,
         smokes: true,
+        spread: None,
     });
     fires.chain(smokes).collect()
 }
@@ -428,6 +511,18 @@ fn check_fires(config: &WorldConfig) -> Result<(), WorldError> {
         range(&key("height_m"), fire.height_m, 0.02, 100.0)?;
         range(&key("growth_m_s"), fire.growth_m_s, -1.0, 1.0)?;
         range(&key("ignites_at_s"), fire.ignites_at_s, -1e6, 1e6)?;
+    }
+    for (k, spread) in config.spreads.iter().enumerate() {
+        let key = |name: &str| format!("spreads[{k}].{name}");
+        range(&key("azimuth_deg"), spread.azimuth_deg, -360.0, 360.0)?;
+        range(&key("speed_m_s"), spread.speed_m_s, 0.001, 10.0)?;
+        range(&key("flank"), spread.flank, 0.05, 1.0)?;
+        range(&key("back"), spread.back, 0.01, 1.0)?;
+        range(&key("residence_s"), spread.residence_s, 0.1, 1e6)?;
+        if !config.fires.iter().any(|fire| fire.name == spread.fire) {
+            let name = spread.fire.clone();
+            return Err(WorldError::NoSuchFire { name });
+        }
     }
     for (k, smoke) in config.smokes.iter().enumerate() {
         let key = |name: &str| format!("smokes[{k}].{name}");

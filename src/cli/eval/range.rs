@@ -1,15 +1,43 @@
 //! `emberfix eval range`.
 
 use crate::cli::Failure;
+use crate::eval::range::{Options, SeedSet, measure, steps};
 
 /// Every way to range a flame, on rendered flames with truth.
 #[derive(Debug, clap::Args)]
 pub struct RangeArguments {
+    /// Which flames.
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Flames at each distance.
+    #[arg(long, default_value_t = 20, value_parser = clap::value_parser!(u16).range(2..=1000))]
+    repeats: u16,
+    /// A few flames only: seconds instead of minutes, and coarse figures.
+    #[arg(long)]
+    quick: bool,
+    /// Flames to tune on, or flames kept aside.
+    #[arg(long, value_enum, default_value = "report")]
+    set: SeedSet,
     #[command(flatten)]
     common: super::Common,
 }
 
 /// Measures and shows.
-pub fn range(_arguments: &RangeArguments) -> Result<(), Failure> {
-    Err(Failure::Refused(anyhow::anyhow!("not there yet")))
+pub fn range(arguments: &RangeArguments) -> Result<(), Failure> {
+    let repeats = if arguments.quick {
+        4
+    } else {
+        arguments.repeats
+    };
+    let options = Options {
+        seed: arguments.seed,
+        repeats: usize::from(repeats),
+        quick: arguments.quick,
+        set: arguments.set,
+    };
+    // Hidden where standard error is no terminal.
+    let bar = indicatif::ProgressBar::new(steps(&options));
+    let report = measure(&options, &|done| bar.inc(done)).map_err(Failure::failed)?;
+    bar.finish_and_clear();
+    super::show(&arguments.common, "range", &report)
 }

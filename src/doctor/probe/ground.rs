@@ -81,6 +81,8 @@ fn test_alarm(mission: &Mission, now: ServiceTime) -> Alarm {
             range_m: 0.0,
             size_m: None,
             trend: None,
+            advice: None,
+            burning: Default::default(),
             degraded: vec!["test".to_owned()],
         },
     }

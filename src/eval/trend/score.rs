@@ -43,6 +43,33 @@ impl Method {
         Self::Ours,
     ];
 
+    /// Its name in figures and tables.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Spectral => "spectral",
+            Self::Visible => "visible",
+            Self::Printed => "printed",
+            Self::Turned => "turned",
+            Self::Ours => "ours",
+        }
+    }
+
+    /// Its place in [`Method::ALL`].
+    #[must_use]
+    pub fn column(self) -> usize {
+        self as usize
+    }
+
+    /// As [`Method::accuracy`], with the samples by which P1's window looks ahead given for nothing:
+    /// what the paper's own way of scoring would say.
+    #[must_use]
+    pub fn accuracy_aligned(self, burn: &Burn) -> f64 {
+        let mut signal = self.signal(burn);
+        signal.drain(..RADIUS);
+        accuracy(&signal, &scaled(&burn.truth))
+    }
+
     /// The method's signal, as it can be known at each sample.
     #[must_use]
     pub fn signal(self, burn: &Burn) -> Vec<f64> {

@@ -2,7 +2,8 @@
 //!
 //! The ray is followed by steps that can't pass through the ground: from a clearance `h`, on ground
 //! that nowhere is steeper than `G`, a ray that goes `c` along and sinks `s` per metre needs at least
-//! `h / (c G + s)` metres to come down. Then the last step is halved.
+//! `h / (c G + s)` metres to come down. Then the last step is halved. A void far beneath a ray does
+//! not stop it.
 
 use super::{Ground, Terrain};
 use crate::locate::View;
@@ -23,14 +24,14 @@ pub enum TerrainHit {
     /// It comes down too flat to say where, or where ground that lay one sigma lower would let it
     /// pass.
     Grazing,
-    /// The ground beneath it has no known height from this range on.
+    /// Where it could come down next, the ground has no known height.
     Void {
-        /// Slant range at which it stops being known, metres.
+        /// Slant range of that place, metres.
         range_m: f64,
     },
-    /// It leaves the tiles at this range.
+    /// It leaves the tiles before it comes down.
     OffTiles {
-        /// Slant range at which it leaves, metres.
+        /// Slant range of the first place that was looked for beyond them, metres.
         range_m: f64,
     },
     /// The camera itself is at or below the ground: one of the two heights is wrong.
@@ -44,7 +45,7 @@ const GRAZING: f64 = 0.03;
 /// Shortest step, metres; on a grid at least this share of its spacing. What a ray may pass through
 /// unseen is a sliver no longer than that.
 const SHORTEST_M: f64 = 0.2;
-const SHORTEST_SHARE: f64 = 0.02;
+const SHORTEST_SHARE: f64 = 0.005;
 /// The vertical turns by 3e-4 over the reach, and rounding: added to each bound on a slope.
 const MARGIN: f64 = 1e-3;
 /// To this the meeting is found, metres.

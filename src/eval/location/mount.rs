@@ -1,0 +1,179 @@
+//! A camera that points 3 degrees off and a clock that is 300 ms late, to be found from a fire alone.
+
+use super::estimator::{Pilot, SetupError};
+use super::flight::{Course, Gusts, Kind};
+use super::law::Law;
+use super::monte_carlo::{Scene, stage_with};
+use super::score::{CHI2_2_90, mean, score};
+use super::truth::{ErrorModel, Flame, Gnss, Lens, Slow, slow, wander};
+use nalgebra::{Rotation3, Vector3};
+use rand::Rng;
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, UnitSphere};
+use serde::Serialize;
+
+/// Injected: boresight, degrees about an axis by chance; clock, seconds late or early.
+pub const BORESIGHT_DEG: f64 = 3.0;
+/// See [`BORESIGHT_DEG`].
+pub const CLOCK_S: f64 = 0.3;
+
+/// One orbit with a bent mount.
+#[derive(Debug, Clone, Copy, Serialize)]
+pub struct MountFlown {
+    /// What is left of the camera's line of sight, degrees: estimated pointing minus the true one,
+    /// across the line of sight.
+    pub pointing_error_deg: f64,
+    /// The same for the mount's share alone (boresight), about the body axes.
+    pub boresight_error_deg: f64,
+    /// Estimated clock minus the true one, milliseconds.
+    pub clock_error_ms: f64,
+    /// The estimator's own sigma of it, milliseconds.
+    pub clock_sigma_ms: f64,
+    /// Looks with an alarm before half of the orbit, and how many of their ellipses held the truth.
+    pub early: (u32, u32),
+    /// Whether the last ellipse held the truth.
+    pub held: bool,
+    /// Horizontal error in the end, metres.
+    pub error_m: f64,
+}
+
+/// One orbit (80 m out, 60 m up, 9 m/s, 3 looks per second). In steady air the orbit is a perfect
+/// circle about the fire, and only the clock is off.
+///
+/// # Errors
+/// [`SetupError`] when the rig is refused.
+pub fn fly(rng: &mut ChaCha8Rng, gusty: bool) -> Result<Option<MountFlown>, SetupError> {
+    let errors = ErrorModel {
+        boresight_deg: if gusty { BORESIGHT_DEG } else { 0.3 },
+        clock_s: CLOCK_S,
+        ..ErrorModel::of(Gnss::Consumer, 1.0)
+    };
+    let course = Course {
+        kind: Kind::Orbit,
+        ground_range_m: 80.0,
+        height_m: 60.0,
+        speed_m_s: 9.0,
+        azimuth_rad: rng.random_range(0.0..std::f64::consts::TAU),
+        duration_s: std::f64::consts::TAU * 80.0 / 9.0,
+        gusts: if gusty {
+            Gusts::new(rng, 3.0, 0.5)
+        } else {
+            Gusts::calm()
+        },
+    };
+    let lens = Lens {
+        depression_deg: course.mean_depression_deg(),
+        ..Lens::wide()
+    };
+    let times_s = course.looks(200, 0.33);
+    let mut wandered = wander(rng, &errors, &times_s, Law::Assumed);
+    inject(rng, &mut wandered, gusty);
+    let scene = Scene {
+        course: &course,
+        lens,
+        flame: Flame {
+            base_m: Vector3::zeros(),
+            size_m: 2.0,
+        },
+        ground: None,
+        above_m: 0.0,
+        errors: &errors,
+        law: Law::Assumed,
+        times_s: &times_s,
+    };
+    let staged = stage_with(&scene, &wandered, rng);
+    let mut pilot = Pilot::new(&lens, &errors, None)?;
+    let (mut early, mut last) = ((0, 0), None);
+    for (index, look) in staged.looks.iter().enumerate() {
+        pilot.look(&look.autopilot, look.seen.as_slice());
+        let told = pilot.fires().into_iter().find(|fire| fire.confirmed);
+        last = told.and_then(|fire| score(&fire.position_m, &fire.covariance_m2, fire.ce90_m));
+        if let Some(scored) = last.filter(|_| index < staged.looks.len() / 2) {
+            early = (early.0 + 1, early.1 + u32::from(scored.nees <= CHI2_2_90));
+        }
+    }
+    let (Some(last), Some(truth), Some(end), Some(learned)) =
+        (last, wandered.last(), times_s.last(), pilot.learned())
+    else {
+        return Ok(None);
+    };
+    let state = course.state(*end);
+    let pointing = learned.pointing_rad - pointing(truth, &state.enu_from_body);
+    let sight = (state.enu_from_body.transpose() * -state.position_m).normalize();
+    let boresight: Vector3<f64> = truth.fixed_rows::<3>(slow::BORESIGHT).into_owned();
+    Ok(Some(MountFlown {
+        pointing_error_deg: pointing.cross(&sight).norm().to_degrees(),
+        boresight_error_deg: (learned.boresight_rad - boresight).norm().to_degrees(),
+        clock_error_ms: 1e3 * (learned.clock_s - truth[slow::CLOCK]),
+        clock_sigma_ms: 1e3 * learned.clock_sigma_s,
+        early,
+        held: last.nees <= CHI2_2_90,
+        error_m: last.error_m,
+    }))
+}
+
+fn inject(rng: &mut ChaCha8Rng, wandered: &mut [Slow], gusty: bool) {
+    let axis: [f64; 3] = UnitSphere.sample(rng);
+    let boresight = Vector3::from(axis) * BORESIGHT_DEG.to_radians();
+    let clock = CLOCK_S * if rng.random_bool(0.5) { 1.0 } else { -1.0 };
+    for slow in wandered {
+        slow[slow::CLOCK] = clock;
+        if gusty {
+            slow.fixed_rows_mut::<3>(slow::BORESIGHT)
+                .copy_from(&boresight);
+        }
+    }
+}
+
+/// All that turns the camera against the reported attitude, about body axes.
+fn pointing(slow: &Slow, enu_from_body: &nalgebra::Matrix3<f64>) -> Vector3<f64> {
+    let boresight: Vector3<f64> = slow.fixed_rows::<3>(slow::BORESIGHT).into_owned();
+    let tilt = Vector3::new(slow[slow::TILT], slow[slow::TILT + 1], 0.0);
+    // Clockwise about down.
+    let down = enu_from_body.transpose() * -Vector3::z();
+    let heading = Rotation3::from_scaled_axis(down * slow[slow::HEADING]).scaled_axis();
+    boresight + tilt + heading
+}
+
+/// Many of them together.
+#[derive(Debug, Clone, Copy, Serialize)]
+pub struct MountSummary {
+    /// Flights.
+    pub flights: usize,
+    /// Root mean square of the pointing error, degrees.
+    pub pointing_rms_deg: f64,
+    /// Root mean square of the boresight's own error, degrees.
+    pub boresight_rms_deg: f64,
+    /// Root mean square of the clock's error, milliseconds.
+    pub clock_rms_ms: f64,
+    /// Mean of the estimator's own sigma of the clock, milliseconds.
+    pub clock_sigma_ms: f64,
+    /// Root mean square of clock error over its sigma.
+    pub clock_error_over_sigma: f64,
+    /// Share of the ellipses of the first half orbit that held the truth.
+    pub early_coverage90: f64,
+    /// Share of the last ellipses that did.
+    pub last_coverage90: f64,
+    /// Root mean square of the horizontal error in the end, metres.
+    pub error_rms_m: f64,
+}
+
+/// Sums up.
+#[must_use]
+pub fn summary(flown: &[MountFlown]) -> MountSummary {
+    let rms = |value: fn(&MountFlown) -> f64| mean(flown.iter().map(|f| value(f).powi(2))).sqrt();
+    let early = flown
+        .iter()
+        .fold((0, 0), |sum, f| (sum.0 + f.early.0, sum.1 + f.early.1));
+    MountSummary {
+        flights: flown.len(),
+        pointing_rms_deg: rms(|f| f.pointing_error_deg),
+        boresight_rms_deg: rms(|f| f.boresight_error_deg),
+        clock_rms_ms: rms(|f| f.clock_error_ms),
+        clock_sigma_ms: mean(flown.iter().map(|f| f.clock_sigma_ms)),
+        clock_error_over_sigma: rms(|f| f.clock_error_ms / f.clock_sigma_ms),
+        early_coverage90: f64::from(early.1) / f64::from(early.0),
+        last_coverage90: mean(flown.iter().map(|f| f64::from(u8::from(f.held)))),
+        error_rms_m: rms(|f| f.error_m),
+    }
+}

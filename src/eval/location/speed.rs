@@ -1,0 +1,91 @@
+//! What a frame costs when very much burns.
+
+use super::estimator::{Pilot, SetupError};
+use super::flight::{Course, Gusts, Kind};
+use super::law::{Draw, Law};
+use super::truth::{Autopilot, ErrorModel, Flame, Gnss, IMAGE_PX, Lens, Seen, Slow, TrueCamera};
+use emberfix_sim::noise::stream;
+use nalgebra::{Matrix3, Vector3};
+use std::time::Instant;
+
+/// Looks before the clock runs, and looks that are timed.
+const WARM: usize = 3;
+const TIMED: usize = 7;
+
+/// Milliseconds per frame, the middle of seven, with `count` fires in the picture that are all seen in
+/// each look, on one thread; and how many fires the estimator then keeps.
+///
+/// # Errors
+/// [`SetupError`] when the rig is refused.
+pub fn step_ms(count: usize, seed: u64) -> Result<(f64, usize), SetupError> {
+    let errors = ErrorModel::of(Gnss::Rtk, 0.5);
+    let lens = Lens {
+        depression_deg: 60.0,
+        ..Lens::wide()
+    };
+    let course = Course {
+        kind: Kind::Hover,
+        ground_range_m: 60.0,
+        height_m: 100.0,
+        speed_m_s: 0.0,
+        azimuth_rad: 0.0,
+        duration_s: 10.0,
+        gusts: Gusts::calm(),
+    };
+    let flames = spread(&course, &lens, count);
+    let mut rng = stream(seed, "speed");
+    let mut draw = Draw::new(stream(seed, "boxes"), Law::Assumed);
+    let mut pilot = Pilot::new(&lens, &errors, None)?;
+    let mut times_ms = Vec::new();
+    for look in 0..WARM + TIMED {
+        let t_s = 0.4 * look as f64;
+        let state = course.state(t_s);
+        let camera = TrueCamera {
+            lens: &lens,
+            state: &state,
+            slow: &Slow::zeros(),
+        };
+        let seen: Vec<Seen> = flames
+            .iter()
+            .filter_map(|flame| camera.see(flame, &errors, &mut draw))
+            .collect();
+        let autopilot = Autopilot::new(&course, t_s, &Slow::zeros(), &errors, &mut rng);
+        let start = Instant::now();
+        pilot.look(&autopilot, &seen);
+        if look >= WARM {
+            times_ms.push(1e3 * start.elapsed().as_secs_f64());
+        }
+    }
+    Ok((
+        super::score::percentile(&mut times_ms, 0.5),
+        pilot.fires().len(),
+    ))
+}
+
+/// Flames on flat ground, in a grid over the picture.
+fn spread(course: &Course, lens: &Lens, count: usize) -> Vec<Flame> {
+    let state = course.state(0.0);
+    let columns = (count as f64 * IMAGE_PX.0 / IMAGE_PX.1).sqrt().ceil();
+    let rows = (count as f64 / columns).ceil();
+    let (sin, cos) = lens.depression_deg.to_radians().sin_cos();
+    #[rustfmt::skip]
+    let body_from_cam = Matrix3::new(
+        0.0, -sin, cos,
+        1.0, 0.0, 0.0,
+        0.0, cos, sin,
+    );
+    let ground_at = |index: usize| {
+        let index = index as f64;
+        let (column, row) = (index % columns, (index / columns).floor());
+        let u = IMAGE_PX.0 * ((column + 0.5) / columns - 0.5) / lens.focal_px;
+        let v = IMAGE_PX.1 * ((row + 0.5) / rows - 0.5) / lens.focal_px;
+        let ray = state.enu_from_body * body_from_cam * Vector3::new(u, v, 1.0);
+        state.position_m + ray * (-state.position_m.z / ray.z)
+    };
+    (0..count)
+        .map(|index| Flame {
+            base_m: ground_at(index),
+            size_m: 0.5,
+        })
+        .collect()
+}
