@@ -206,12 +206,7 @@ fn middle(board: &Board, corners: &[Corner]) -> Option<RawPixel> {
 }
 
 /// The middle of the board in a picture.
-fn middle_in(
-    board: &Board,
-    rig: &Rig,
-    picture: &Picture,
-    window: Rect,
-) -> Option<(RawPixel, f64)> {
+fn middle_in(board: &Board, rig: &Rig, picture: &Picture, window: Rect) -> Option<(RawPixel, f64)> {
     let bgr = ImageDecoder::new(rig).left(&picture.left).ok()?;
     let part = Mat::roi(&bgr, window).ok()?;
     let mut grey = Mat::default();

@@ -117,35 +117,53 @@ fn fly(path: &Path, seed: u64, flight: u32) -> Result<Flown, BoresightEvalError>
     ]
     .map(f64::to_degrees);
     let (world, course) = emberfix_sim::setup(&sim)?;
-    let file = tempfile::NamedTempFile::new()?;
-    let writer = std::io::BufWriter::new(file.reopen()?);
+    let scratch = Scratch::new(seed);
+    let writer = std::io::BufWriter::new(std::fs::File::create(&scratch.0)?);
     let errors = sim.sim.errors.clone();
     emberfix_sim::record::record(&sim, &world, &course, &errors, writer, |_| {})?;
 
-    let mission = Mission::load(path)?;
+    let mission = Mission::load(&sim.path)?;
     let no_board = || BoresightEvalError::NoBoard {
         path: path.display().to_string(),
     };
     let laid = sim.sim.world.boards.first().ok_or_else(no_board)?;
-    let board = Board::parse(
-        &format!("{}x{}", laid.columns, laid.rows),
-        laid.square_m,
-    )?;
+    let board = Board::parse(&format!("{}x{}", laid.columns, laid.rows), laid.square_m)?;
     let marker = surveyed(&sim, laid).ok_or_else(no_board)?;
     let start = Start::of(&mission, Some(marker));
-    let gathered = gather(file.path(), &mission, &start, Picker::Board(board), &mut |_| {})?;
-    let found = solve(&start, &gathered.sights)
-        .ok()
-        .map(|solution| Found {
-            boresight_deg: apart(solution.mount, mount).to_degrees(),
-            clock_ms: (solution.clock_s() - CLOCK_OFF_S).abs() * 1e3,
-            solution,
-        });
+    let gathered = gather(
+        &scratch.0,
+        &mission,
+        &start,
+        Picker::Board(board),
+        &mut |_| {},
+    )?;
+    let found = solve(&start, &gathered.sights).ok().map(|solution| Found {
+        boresight_deg: apart(solution.mount, mount).to_degrees(),
+        clock_ms: (solution.clock_s() - CLOCK_OFF_S).abs() * 1e3,
+        solution,
+    });
     Ok(Flown {
         seed,
         gathered,
         found,
     })
+}
+
+/// A recording that goes when it was looked at.
+struct Scratch(std::path::PathBuf);
+
+impl Scratch {
+    fn new(seed: u64) -> Self {
+        let name = format!("emberfix-boresight-{}-{seed}.mcap", std::process::id());
+        Self(std::env::temp_dir().join(name))
+    }
+}
+
+impl Drop for Scratch {
+    fn drop(&mut self) {
+        // What can't be removed the system clears away.
+        let _removed = std::fs::remove_file(&self.0);
+    }
 }
 
 /// Place of the board's printed side, as a survey gives it.
@@ -156,7 +174,7 @@ fn surveyed(sim: &SimMission, board: &BoardConfig) -> Option<Marker> {
     let height = EllipsoidHeight::from_m(lla.height_m);
     let place =
         emberfix_frames::place_from_degrees(lla.latitude_deg, lla.longitude_deg, height).ok()?;
-    
+
     Some(Marker {
         place,
         sigma_m: SURVEY_M,
@@ -187,7 +205,10 @@ fn apart(a: MountAngles, b: MountAngles) -> f64 {
 }
 
 fn report(flown: &[Flown]) -> Report {
-    let found: Vec<&Found> = flown.iter().filter_map(|flight| flight.found.as_ref()).collect();
+    let found: Vec<&Found> = flown
+        .iter()
+        .filter_map(|flight| flight.found.as_ref())
+        .collect();
     // A flight that shows nothing is a failure, not a smaller sample.
     let worst = |of: fn(&Found) -> f64| {
         (found.len() == flown.len() && !found.is_empty())
@@ -215,8 +236,15 @@ fn report(flown: &[Flown]) -> Report {
             CLOCK_OFF_S * 1e3
         ),
         header: [
-            "seed", "pairs", "seen", "used", "mount off by (deg)", "one sigma", "clock off by (ms)",
-            "one sigma", "left over (px)",
+            "seed",
+            "pairs",
+            "seen",
+            "used",
+            "mount off by (deg)",
+            "one sigma",
+            "clock off by (ms)",
+            "one sigma",
+            "left over (px)",
         ]
         .map(str::to_owned)
         .to_vec(),
@@ -242,7 +270,10 @@ fn row(flight: &Flown) -> Vec<String> {
             format!("{:.3}", found.boresight_deg),
             format!("{:.3}", found.solution.boresight_sigma().to_degrees()),
             format!("{:.2}", found.clock_ms),
-            format!("{:.2}", found.solution.sigma(Parameter::Clock as usize) * 1e3),
+            format!(
+                "{:.2}",
+                found.solution.sigma(Parameter::Clock as usize) * 1e3
+            ),
             format!("{:.2}", found.solution.rms_px),
         ]),
         None => row.extend(["0"; 6].map(str::to_owned)),
