@@ -1,6 +1,6 @@
 //! Sights of the marker, and the way of the airframe about each, from a recording.
 
-use super::model::{BodyAt, Sight, Way};
+use super::model::{BodyAt, Sight, Start, Way};
 use crate::detect::{DetectionClass, Detector, LeftImage};
 use crate::ingest::{EncodedImage, ImageDecoder, Recorded, Recording, SourceError, StereoPair};
 use crate::mission::Mission;
@@ -13,7 +13,7 @@ use emberfix_frames::{
 };
 use emberfix_mav::telemetry::{GpsRaw, Heartbeat};
 use emberfix_mav::{ComponentId, FrameReader, Received, SystemId, Telemetry};
-use opencv::core::Mat;
+use opencv::core::{Mat, Rect};
 use opencv::imgproc::{COLOR_BGR2GRAY, cvt_color_def};
 use rayon::prelude::*;
 use std::collections::{BTreeMap, VecDeque};
@@ -155,18 +155,20 @@ impl Marker {
     }
 }
 
-/// Reads a recording through. `progress` is told the number of pairs so far.
+/// Reads a recording through. `progress` is told the number of pairs so far. A board is only looked for
+/// where a surveyed marker can be, by `start`.
 ///
 /// # Errors
 /// [`SourceError`] when it can't be read.
 pub fn gather(
     recording: &Path,
     mission: &Mission,
+    start: &Start,
     picker: Picker,
     progress: &mut dyn FnMut(u64),
 ) -> Result<Gathered, SourceError> {
     let mut source = Recording::open(recording, &mission.rig)?;
-    let mut gatherer = Gatherer::new(mission, picker);
+    let mut gatherer = Gatherer::new(mission, start.clone(), picker);
     let mut frames = FrameReader::new();
     while let Some(event) = source.next_event()? {
         match event {
@@ -204,13 +206,51 @@ fn middle(board: &Board, corners: &[Corner]) -> Option<RawPixel> {
 }
 
 /// The middle of the board in a picture.
-fn middle_in(board: &Board, rig: &Rig, picture: &Picture) -> Option<(RawPixel, f64)> {
+fn middle_in(board: &Board, rig: &Rig, picture: &Picture, window: Rect) -> Option<(RawPixel, f64)> {
     let bgr = ImageDecoder::new(rig).left(&picture.left).ok()?;
+    let part = Mat::roi(&bgr, window).ok()?;
     let mut grey = Mat::default();
-    cvt_color_def(&bgr, &mut grey, COLOR_BGR2GRAY).ok()?;
+    cvt_color_def(&part, &mut grey, COLOR_BGR2GRAY).ok()?;
     let corners = find_corners(&grey, board).ok()??;
-    Some((middle(board, &corners)?, BOARD_SIGMA_PX))
+    let middle = middle(board, &corners)?;
+    let pixel = RawPixel {
+        u: middle.u + f64::from(window.x),
+        v: middle.v + f64::from(window.y),
+    };
+    Some((pixel, BOARD_SIGMA_PX))
 }
+
+/// Part of the picture in which the marker can be: the whole of it, unless it was surveyed. `None` when
+/// it can't be seen.
+fn window(start: &Start, way: &Way) -> Option<Rect> {
+    let size = start.camera.image_size_px;
+    let (width, height) = (f64::from(size.0), f64::from(size.1));
+    if start.marker_m.is_none() {
+        return Some(Rect::new(0, 0, size.0 as i32, size.1 as i32));
+    }
+    let margin = start.camera.focal_px.0 * WINDOW_RAD;
+    let (mut low, mut high) = ((f64::MAX, f64::MAX), (f64::MIN, f64::MIN));
+    for step in -4..=4 {
+        if let Some(pixel) = start.predict(way, f64::from(step) * 0.1) {
+            low = (low.0.min(pixel.u), low.1.min(pixel.v));
+            high = (high.0.max(pixel.u), high.1.max(pixel.v));
+        }
+    }
+    let left = (low.0 - margin).max(0.0);
+    let top = (low.1 - margin).max(0.0);
+    let right = (high.0 + margin).min(width);
+    let bottom = (high.1 + margin).min(height);
+    let large = right - left > LEAST_WINDOW_PX && bottom - top > LEAST_WINDOW_PX;
+    large.then(|| {
+        let (x, y) = (left as i32, top as i32);
+        Rect::new(x, y, right as i32 - x, bottom as i32 - y)
+    })
+}
+
+/// The mount of a board's flight may be off by this, radians: nine degrees.
+const WINDOW_RAD: f64 = 0.157;
+/// A board is not found in less, pixels.
+const LEAST_WINDOW_PX: f64 = 40.0;
 
 /// The base of the best fire in a picture.
 fn fire_in(detector: &mut dyn Detector, rig: &Rig, picture: &Picture) -> Option<(RawPixel, f64)> {
@@ -236,6 +276,7 @@ struct Picture {
 struct Gatherer {
     rig: Arc<Rig>,
     datum: Wgs84,
+    start: Start,
     picker: Picker,
     poses: PoseEstimator,
     vehicle: Option<SystemId>,
@@ -246,10 +287,11 @@ struct Gatherer {
 }
 
 impl Gatherer {
-    fn new(mission: &Mission, picker: Picker) -> Self {
+    fn new(mission: &Mission, start: Start, picker: Picker) -> Self {
         Self {
             rig: Arc::clone(&mission.rig),
             datum: mission.datum,
+            start,
             picker,
             poses: PoseEstimator::new(mission.pose),
             vehicle: (mission.system_id != 0).then_some(SystemId(mission.system_id)),
@@ -340,7 +382,10 @@ impl Gatherer {
             }
             Picker::Board(board) => ready
                 .par_iter()
-                .map(|(picture, _)| middle_in(board, &rig, picture))
+                .map(|(picture, way)| {
+                    let window = window(&self.start, way)?;
+                    middle_in(board, &rig, picture, window)
+                })
                 .collect(),
             Picker::Fire(detector) => ready
                 .iter()

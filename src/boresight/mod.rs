@@ -26,6 +26,7 @@ mod tests;
 mod words;
 
 pub use flight::{Gathered, Marker, Picker, Picks, PicksError, gather};
+pub(crate) use model::mount_of;
 pub use model::{BodyAt, Parameter, Sight, Start, Way};
 pub use solve::{Solution, SolveError, solve};
 pub use words::observability;

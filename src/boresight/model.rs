@@ -178,6 +178,18 @@ impl Start {
     }
 }
 
+impl Start {
+    /// Where the surveyed marker should be seen if the rig file were right and the clock off by
+    /// `clock_s`; `None` behind the camera.
+    pub(super) fn predict(&self, way: &Way, clock_s: f64) -> Option<RawPixel> {
+        let mut x = Parameters::zeros();
+        x[Parameter::Clock as usize] = clock_s;
+        x.fixed_rows_mut::<3>(Parameter::Marker as usize)
+            .copy_from(&self.marker_m?);
+        Model::new(self, &x).predict(way)
+    }
+}
+
 fn arm_of(rig: &Rig) -> Vector3<f64> {
     rig.lever_arm().metres()
 }
@@ -240,7 +252,7 @@ impl<'a> Model<'a> {
 
 /// The mount angles of a rotation from camera to body: the inverse of
 /// [`body_from_camera`](emberfix_frames::body_from_camera).
-pub(super) fn mount_of(body_from_camera: &Matrix3<f64>) -> MountAngles {
+pub(crate) fn mount_of(body_from_camera: &Matrix3<f64>) -> MountAngles {
     let boresight = body_from_camera.column(2);
     let yaw_rad = boresight.y.atan2(boresight.x);
     let depression_rad = boresight.z.atan2(boresight.xy().norm());

@@ -556,8 +556,8 @@ fn situate(place: &Wgs84, poses: &PoseEstimator, terrain: Option<&dyn Terrain>) 
         advice: None,
         altitude: place.height() - poses.undulation(place),
         above_ground: ground.map(|ground| place.height() - ground),
-            assessment: Assessment::default(),
-            area: None,
+        assessment: Assessment::default(),
+        area: None,
         degraded: degraded.into_iter().map(str::to_owned).collect(),
     }
 }

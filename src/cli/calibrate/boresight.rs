@@ -75,8 +75,8 @@ pub fn boresight(arguments: &BoresightArguments) -> Result<(), Failure> {
         })
         .transpose()
         .map_err(Failure::refused)?;
-    let gathered = read(arguments, &mission)?;
     let start = Start::of(&mission, marker);
+    let gathered = read(arguments, &mission, &start)?;
     let solution = solve(&start, &gathered.sights).map_err(Failure::failed)?;
     let words = observability(&solution);
     if arguments.json {
@@ -92,13 +92,17 @@ pub fn boresight(arguments: &BoresightArguments) -> Result<(), Failure> {
     Ok(())
 }
 
-fn read(arguments: &BoresightArguments, mission: &Mission) -> Result<Gathered, Failure> {
+fn read(
+    arguments: &BoresightArguments,
+    mission: &Mission,
+    start: &Start,
+) -> Result<Gathered, Failure> {
     let picker = picker(arguments, mission)?;
     let bar = indicatif::ProgressBar::new_spinner();
     if let Ok(style) = indicatif::ProgressStyle::with_template("{spinner} {pos} pairs, {elapsed}") {
         bar.set_style(style);
     }
-    let gathered = gather(&arguments.recording, mission, picker, &mut |pairs| {
+    let gathered = gather(&arguments.recording, mission, start, picker, &mut |pairs| {
         bar.set_position(pairs);
     });
     bar.finish_and_clear();

@@ -2,6 +2,7 @@
 
 use crate::cli::Failure;
 use crate::eval::calibration::{Options, measure};
+use crate::eval::{Report, boresight};
 use indicatif::{ProgressBar, ProgressStyle};
 use std::path::PathBuf;
 
@@ -20,6 +21,12 @@ pub struct CalibrationArguments {
     /// Folder of the real pictures `left01.jpg` ..; that of EMBERFIX_SHARED or ../shared if not given.
     #[arg(long)]
     chess_a: Option<PathBuf>,
+    /// Rendered flights past a surveyed board, to find mount and clock by; 0 for none.
+    #[arg(long, default_value_t = 4)]
+    flights: u32,
+    /// Mission of those flights.
+    #[arg(long, default_value = "missions/marker.toml")]
+    flight_mission: PathBuf,
     #[command(flatten)]
     common: super::Common,
 }
@@ -38,7 +45,28 @@ pub fn calibration(arguments: &CalibrationArguments) -> Result<(), Failure> {
     }
     let report = measure(&options, || bar.inc(1)).map_err(Failure::failed)?;
     bar.finish_and_clear();
+    let report = with_flights(arguments, report)?;
     super::show(&arguments.common, "calibration", &report)
+}
+
+/// The flights' figures behind the rigs'.
+fn with_flights(arguments: &CalibrationArguments, report: Report) -> Result<Report, Failure> {
+    if arguments.flights == 0 {
+        return Ok(report);
+    }
+    let bar = ProgressBar::new(arguments.flights.into()).with_message("rendered flights");
+    if let Ok(style) = ProgressStyle::with_template("{msg} {wide_bar} {pos}/{len}") {
+        bar.set_style(style);
+    }
+    let options = boresight::Options {
+        flights: arguments.flights,
+        seed: arguments.seed,
+    };
+    let flown = boresight::measure(&arguments.flight_mission, options, &mut |done| {
+        bar.set_position(done.into());
+    });
+    bar.finish_and_clear();
+    Ok(report.with("boresight", flown.map_err(Failure::failed)?))
 }
 
 fn chess_a(arguments: &CalibrationArguments) -> Option<PathBuf> {
