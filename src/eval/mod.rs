@@ -6,9 +6,9 @@
 //! measured is the code that flies, through its public interface. This is the only room that sees the
 //! simulator; nothing that flies depends on this room.
 
-pub mod trend;
-pub mod range;
 pub mod location;
+pub mod range;
+pub mod trend;
 
 use emberfix_report::{Figure, PlotError, Sheet};
 use serde::Serialize;

@@ -20,7 +20,9 @@ pub(super) fn find(scene: &Scene<'_>, config: &RangeConfig) -> Result<Disparity,
     if scene.flame.count() < config.min_support as usize {
         return Err(Refusal::TooSmall.into());
     }
-    let outlined = scene.flame.grown(knob("OUTLINE", OUTLINE_PX as f64) as usize);
+    let outlined = scene
+        .flame
+        .grown(knob("OUTLINE", OUTLINE_PX as f64) as usize);
     let runs = outlined.runs();
     let offsets = (-scene.search.greatest)..=(-scene.search.least);
     let curve = correlate(&scene.left.gray, &scene.right, &runs, offsets);
@@ -30,11 +32,18 @@ pub(super) fn find(scene: &Scene<'_>, config: &RangeConfig) -> Result<Disparity,
     let refined = Refiner::new(&scene.left.gray, &scene.right, &sharp, -peak.at)
         .and_then(|refiner| refiner.refine())
         .ok_or(Refusal::Inconsistent)?;
-    Ok(disparity(&scene.flame, refined.disparity_px, refined.sigma_px))
+    Ok(disparity(
+        &scene.flame,
+        refined.disparity_px,
+        refined.sigma_px,
+    ))
 }
 
 pub(super) fn knob(name: &str, usual: f64) -> f64 {
-    std::env::var(name).ok().and_then(|v| v.parse().ok()).unwrap_or(usual)
+    std::env::var(name)
+        .ok()
+        .and_then(|v| v.parse().ok())
+        .unwrap_or(usual)
 }
 
 /// The best place in the right eye, if it is good enough and has no rival.

@@ -47,7 +47,11 @@ pub(super) fn find(
     let refined = Refiner::new(&left, &right, &runs, -best.at)
         .and_then(|refiner| refiner.refine())
         .ok_or(Refusal::Inconsistent)?;
-    Ok(disparity(&scene.flame, refined.disparity_px, refined.sigma_px))
+    Ok(disparity(
+        &scene.flame,
+        refined.disparity_px,
+        refined.sigma_px,
+    ))
 }
 
 fn least_likeness(cost: Cost) -> f64 {
@@ -66,8 +70,12 @@ fn gradient(gray: &Gray) -> Gray {
     for row in 1..height.saturating_sub(1) {
         for column in 1..width.saturating_sub(1) {
             let (w, e, n, s) = (column - 1, column + 1, row - 1, row + 1);
-            let across = at(e, n) + 2.0 * at(e, row) + at(e, s) - at(w, n) - 2.0 * at(w, row) - at(w, s);
-            let down = at(w, s) + 2.0 * at(column, s) + at(e, s) - at(w, n) - 2.0 * at(column, n) - at(e, n);
+            let across =
+                at(e, n) + 2.0 * at(e, row) + at(e, s) - at(w, n) - 2.0 * at(w, row) - at(w, s);
+            let down = at(w, s) + 2.0 * at(column, s) + at(e, s)
+                - at(w, n)
+                - 2.0 * at(column, n)
+                - at(e, n);
             values[row * width + column] = across.hypot(down) / 4.0;
         }
     }

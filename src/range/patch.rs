@@ -263,13 +263,14 @@ impl<'a, const N: usize> Raw<'a, N> {
     fn at(&self, u: f32, v: f32) -> [f32; N] {
         let (u, v) = (u.clamp(0.0, self.last_column), v.clamp(0.0, self.last_row));
         let (across, down) = (cubic(u.fract()), cubic(v.fract()));
-        let column = |k: usize| {
-            ((u as usize + k).saturating_sub(1)).min(self.last_column as usize) * N
-        };
+        let column =
+            |k: usize| ((u as usize + k).saturating_sub(1)).min(self.last_column as usize) * N;
         let columns = [column(0), column(1), column(2), column(3)];
         let mut sum = [0.0; N];
         for (k, weight) in down.into_iter().enumerate() {
-            let row = (v as usize + k).saturating_sub(1).min(self.last_row as usize);
+            let row = (v as usize + k)
+                .saturating_sub(1)
+                .min(self.last_row as usize);
             let first = row * self.columns * N;
             for (column, share) in columns.into_iter().zip(across) {
                 let pixel = &self.bytes[first + column..first + column + N];

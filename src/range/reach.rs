@@ -1,7 +1,7 @@
 //! How far a disparity reaches: measured, only "at least this far", or not to be believed.
 
-use super::{Disparity, Methods, RangeConfig, Ranging, Refusal};
 use super::correlate::knob;
+use super::{Disparity, Methods, RangeConfig, Ranging, Refusal};
 use emberfix_calib::Rig;
 
 /// What decides it.
@@ -15,7 +15,6 @@ pub(super) struct Reach {
 /// A flame is about as deep as it is wide, and what is seen of it is not just its axis: one sigma of
 /// the difference, as a share of the disparity that its depth spans.
 const SHAPE: f64 = 0.06;
-
 
 impl Reach {
     pub fn new(rig: &Rig, config: &RangeConfig) -> Self {
@@ -33,10 +32,7 @@ impl Reach {
         let sigma_px = (knob("SCALE", 1.0) * found.sigma_px)
             .hypot(knob("SHAPE", SHAPE) * depth_px)
             .hypot(self.sigma_floor_px);
-        let found = &Disparity {
-            sigma_px,
-            ..*found
-        };
+        let found = &Disparity { sigma_px, ..*found };
         let from_infinity = found.px - rectification.infinity_disparity_px();
         let sigma = found.sigma_px.hypot(self.rig.sigmas().disparity_bias_px);
         if from_infinity < -2.0 * sigma {

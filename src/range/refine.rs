@@ -217,7 +217,13 @@ fn pooled(parts: &[Refined]) -> Option<Refined> {
         return None;
     }
     let mut mean = median(parts.iter().map(|part| part.disparity_px).collect())?;
-    let spread = 1.4826 * median(parts.iter().map(|p| (p.disparity_px - mean).abs()).collect())?;
+    let spread = 1.4826
+        * median(
+            parts
+                .iter()
+                .map(|p| (p.disparity_px - mean).abs())
+                .collect(),
+        )?;
     let noise = median(parts.iter().map(|part| part.sigma_px).collect())?;
     let between = (spread.powi(2) - noise.powi(2)).max(0.0);
     let mut sigma_px = f64::NAN;

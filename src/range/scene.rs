@@ -56,7 +56,10 @@ impl Mask {
                 }
             }
         }
-        Self { area: self.area, kept }
+        Self {
+            area: self.area,
+            kept,
+        }
     }
 
     pub fn runs(&self) -> Vec<Run> {
@@ -67,7 +70,11 @@ impl Mask {
                 match (from, *kept) {
                     (None, true) => from = Some(column),
                     (Some(first), false) => {
-                        runs.push(Run { row, from: first, to: column });
+                        runs.push(Run {
+                            row,
+                            from: first,
+                            to: column,
+                        });
                         from = None;
                     }
                     _ => {}
@@ -149,7 +156,11 @@ impl<'a> Scene<'a> {
     /// The left eye as far as what the right one shows `offset` columns on may come from there.
     pub fn back(&self, offset: i32) -> Result<Gray, RangeError> {
         let area = self.left.gray.area;
-        let area = area.grown(-offset - self.search.least, offset + self.search.greatest, 0);
+        let area = area.grown(
+            -offset - self.search.least,
+            offset + self.search.greatest,
+            0,
+        );
         self.cutter.left_gray(self.left_bgr, area)
     }
 }
@@ -176,10 +187,7 @@ fn flame(left: &Colour, target: &Area, config: &RangeConfig) -> Mask {
         .collect();
     let enough =
         |kept: &Vec<bool>| kept.iter().filter(|kept| **kept).count() >= config.min_support as usize;
-    let kept = [shining, gate]
-        .into_iter()
-        .find(enough)
-        .unwrap_or(inside);
+    let kept = [shining, gate].into_iter().find(enough).unwrap_or(inside);
     Mask { area, kept }
 }
 

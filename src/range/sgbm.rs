@@ -92,7 +92,10 @@ fn borne_out(
         ..scene.flame.clone()
     };
     let area = matched.area;
-    for Sample { at: (column, row), .. } in samples {
+    for Sample {
+        at: (column, row), ..
+    } in samples
+    {
         let index = (row - area.top) as usize * area.width() + (column - area.left) as usize;
         matched.kept[index] = true;
     }

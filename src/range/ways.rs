@@ -6,8 +6,8 @@ use super::reach::Reach;
 use super::scene::{Scene, Search};
 use super::sgbm::SemiGlobal;
 use super::{
-    Method, Methods, Miss, RangeConfig, RangeError, Ranger, Ranging, RawPair, Target,
-    best, centroid, correlate,
+    Method, Methods, Miss, RangeConfig, RangeError, Ranger, Ranging, RawPair, Target, best,
+    centroid, correlate,
 };
 use emberfix_calib::Rig;
 

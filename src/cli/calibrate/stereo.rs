@@ -101,7 +101,8 @@ fn board(arguments: &StereoArguments) -> Result<Board, Failure> {
 }
 
 fn file_pairs(places: &[PathBuf]) -> Result<Vec<FilePair>, Failure> {
-    let files = pairs::images(places).map_err(|error| Failure::Refused(anyhow!("images: {error}")))?;
+    let files =
+        pairs::images(places).map_err(|error| Failure::Refused(anyhow!("images: {error}")))?;
     let pairs = pairs::pair_up(&files);
     if pairs.is_empty() {
         return Err(Failure::Refused(anyhow!(
@@ -147,8 +148,12 @@ fn look(pairs: &[FilePair], board: &Board) -> Result<Looked, Failure> {
                 let view = make_consistent(board, View { name, left, right });
                 looked.views.push(view);
             }
-            (Err(why), _) => looked.unusable.push((pair.name.clone(), format!("left: {why}"))),
-            (_, Err(why)) => looked.unusable.push((pair.name.clone(), format!("right: {why}"))),
+            (Err(why), _) => looked
+                .unusable
+                .push((pair.name.clone(), format!("left: {why}"))),
+            (_, Err(why)) => looked
+                .unusable
+                .push((pair.name.clone(), format!("right: {why}"))),
         }
     }
     Ok(looked)
@@ -271,7 +276,10 @@ fn summary(calibration: &Calibration) -> Result<Table, Failure> {
         calibration.held_out.rms_px
     );
     table.add_row(["reprojection error", &errors]);
-    let rows = format!("{:.3} px", epipolar_rms_px(calibration).map_err(Failure::failed)?);
+    let rows = format!(
+        "{:.3} px",
+        epipolar_rms_px(calibration).map_err(Failure::failed)?
+    );
     table.add_row(["row difference, rectified", &rows]);
     table.add_row(["focal length, left", &with(0)]);
     table.add_row(["focal length, right", &with(9)]);
@@ -384,7 +392,9 @@ fn report(
         at: &now(),
         board: &format!("{}, {} mm squares", arguments.board, arguments.square_mm),
         calibration,
-        pair: images.as_ref().map(|(left, right)| (middle.as_str(), left, right)),
+        pair: images
+            .as_ref()
+            .map(|(left, right)| (middle.as_str(), left, right)),
     };
     page(&input).map_err(Failure::failed)
 }
@@ -406,7 +416,10 @@ fn write_rig(
     calibration: &Calibration,
 ) -> Result<(), Failure> {
     let solution = &calibration.solution;
-    let at_10m = calibration.range_errors.iter().find(|error| error.depth_m == 10.0);
+    let at_10m = calibration
+        .range_errors
+        .iter()
+        .find(|error| error.depth_m == 10.0);
     let parts = RigParts {
         name: rig_name(arguments),
         left: solution.left.clone(),
