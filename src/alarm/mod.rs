@@ -4,8 +4,10 @@
 //! latitude, ellipsoid height). The position is the base of the fire: where the burning thing
 //! stands, beneath the flame's centre. Pure: no I/O, no clock.
 
+mod burning;
 mod desk;
 
+pub use burning::{Area, Burning, TrendProbability};
 pub use desk::{AlarmDesk, LEAST_S, REPEAT_S, Situation};
 
 use emberfix_frames::{Covariance, EllipsoidHeight, MissionEnu, ServiceTime, Wgs84, Wgs84Parts};
@@ -65,6 +67,17 @@ pub struct SizeM {
     pub height: f64,
 }
 
+/// A course that makes a position better.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Advice {
+    /// Course over ground to fly, degrees clockwise from north, 0 to 360.
+    pub course_deg: f64,
+    /// How far, metres.
+    pub distance_m: f64,
+    /// CE90 to be expected then, metres.
+    pub ce90_m: f64,
+}
+
 /// One revision of one fire's alarm. Serialised by [`Alarm::to_geojson`], read by
 /// [`Alarm::from_geojson`]; field meanings are the contract's (`README.md`, "The alarm").
 #[derive(Debug, Clone, PartialEq)]
@@ -116,6 +129,12 @@ pub struct AlarmProperties {
     pub size_m: Option<SizeM>,
     /// How the fire changes (slope of its relative size, per second), if known.
     pub trend: Option<f64>,
+    /// Which way to fly so that the ellipse shrinks most; absent when nothing is worth it.
+    #[serde(default)]
+    pub advice: Option<Advice>,
+    /// How it burns.
+    #[serde(flatten)]
+    pub burning: Burning,
     /// Reasons why the ellipse is wider than it could be; empty when all is well.
     pub degraded: Vec<String>,
 }

@@ -252,6 +252,8 @@ impl SpatialAlarm {
                 range_m: self.range_m,
                 size_m: None,
                 trend: None,
+                advice: None,
+                burning: Default::default(),
                 degraded: vec![DEGRADED_SUMMARY.to_owned()],
             },
         })

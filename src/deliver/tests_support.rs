@@ -29,6 +29,8 @@ pub(super) fn alarm(number: u32, revision: u32) -> Alarm {
             range_m: 12.5,
             size_m: None,
             trend: None,
+            advice: None,
+            burning: Default::default(),
             degraded: Vec::new(),
         },
     }

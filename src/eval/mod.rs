@@ -9,6 +9,7 @@
 pub mod location;
 pub mod range;
 pub mod trend;
+pub mod calibration;
 
 use emberfix_report::{Figure, PlotError, Sheet};
 use serde::Serialize;

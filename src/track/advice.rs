@@ -10,9 +10,11 @@
 //! pilot's; a course that leads nearer to the fire than [`NEAREST_SHARE`] of the present ground range
 //! or [`NEAREST_M`] is never proposed. Errors are taken not to wander during the few seconds.
 
+use super::{COMMON, Fire, Tracker};
+use crate::alarm::{Advice, FireState};
+use crate::locate::{Shared, View};
 use emberfix_frames::{Covariance, Matrix3, MissionEnu, Vector3};
 use nalgebra::{SMatrix, SVector};
-use serde::{Deserialize, Serialize};
 
 /// Numbers of the covariance that advice rests on: the fire's east, north, up (m); then what must be
 /// added to the truth to get what is reported: GNSS east, north, up (m), heading (rad clockwise),
@@ -24,17 +26,6 @@ const HEADING: usize = 6;
 const TURN: usize = 7;
 const DISPARITY: usize = 10;
 const CLOCK: usize = 11;
-
-/// What flying a course is worth.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct Advice {
-    /// Course over ground to fly, degrees clockwise from north, 0 to 360.
-    pub course_deg: f64,
-    /// How far, metres.
-    pub distance_m: f64,
-    /// CE90 to be expected then, metres.
-    pub ce90_m: f64,
-}
 
 /// What a look is worth.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -189,6 +180,75 @@ impl Outlook<'_> {
 }
 
 type Row = SVector<f64, ADVISED>;
+
+/// New in each look, for want of the coming ones' own: edge of a box, disparity, pixels.
+const BOX_PX: f64 = 2.0;
+const DISPARITY_PX: f64 = 0.25;
+/// Slowest flight that is advised, m/s.
+const SLOWEST_M_S: f64 = 3.0;
+
+impl Tracker {
+    /// Which way to fly from `view` so that a fire's ellipse shrinks most; `None` when nothing is
+    /// worth it, and for fires that are out or turned out to be another one.
+    #[must_use]
+    pub fn advise(&self, fire: &Fire, view: &View<'_>) -> Option<Advice> {
+        if fire.state == FireState::Out || fire.merged_into.is_some() {
+            return None;
+        }
+        let rect = view.rig.rectification();
+        let covariance = self.advised(fire, view);
+        advise(&Outlook {
+            covariance: &covariance,
+            fire: fire.estimate.position_m(),
+            camera: view.camera_enu,
+            speed_m_s: view.pose.velocity_enu_m_s.norm().max(SLOWEST_M_S),
+            look: LookQuality {
+                bearing_rad: (BOX_PX / rect.focal_px()).hypot(view.pose.attitude_noise_rad),
+                focal_baseline_px_m: rect.focal_px() * view.rig.baseline_m(),
+                disparity_px: DISPARITY_PX,
+            },
+        })
+    }
+
+    /// One fire and the sums of the shared errors that turn and move the camera, see [`ADVISED`].
+    fn advised(&self, fire: &Fire, view: &View<'_>) -> SMatrix<f64, ADVISED, ADVISED> {
+        let (block, common) = (fire.estimate.block(), self.common.covariance());
+        let by_state = block.chart().position_by_state(fire.estimate.state());
+        let mut by_common = SMatrix::<f64, ADVISED, COMMON>::zeros();
+        by_common
+            .fixed_rows_mut::<3>(0)
+            .copy_from(&(by_state * block.by_common()));
+        for (row, shared) in SUMMED {
+            let index = shared.0 as usize + shared.1;
+            by_common[(row, index)] += view.sigmas()[index];
+        }
+        let mut with_common = SMatrix::<f64, ADVISED, COMMON>::zeros();
+        with_common.gemm(1.0, &by_common, common, 0.0);
+        let mut covariance = with_common * by_common.transpose();
+        let mut own = covariance.fixed_view_mut::<3, 3>(0, 0);
+        own += by_state * block.own() * by_state.transpose();
+        covariance
+    }
+}
+
+/// Which shared errors (kind, axis) make up each number of [`ADVISED`].
+const SUMMED: [(usize, (Shared, usize)); 15] = [
+    (GNSS, (Shared::GnssConstant, 0)),
+    (GNSS + 1, (Shared::GnssConstant, 1)),
+    (GNSS + 2, (Shared::GnssConstant, 2)),
+    (GNSS, (Shared::Gnss, 0)),
+    (GNSS + 1, (Shared::Gnss, 1)),
+    (GNSS + 2, (Shared::Gnss, 2)),
+    (HEADING, (Shared::HeadingConstant, 0)),
+    (HEADING, (Shared::Heading, 0)),
+    (TURN, (Shared::Boresight, 0)),
+    (TURN + 1, (Shared::Boresight, 1)),
+    (TURN + 2, (Shared::Boresight, 2)),
+    (TURN, (Shared::Tilt, 0)),
+    (TURN + 1, (Shared::Tilt, 1)),
+    (DISPARITY, (Shared::Disparity, 0)),
+    (CLOCK, (Shared::Clock, 0)),
+];
 
 #[cfg(test)]
 mod tests {

@@ -31,7 +31,7 @@ mod measure;
 mod pairs;
 mod shared_errors;
 
-pub use advice::{ADVISED, Advice, LookQuality, Outlook, advise};
+pub use advice::{ADVISED, LookQuality, Outlook, advise};
 pub use assign::{Candidate, assign};
 pub use block::{Block, Chart};
 pub use common::{COMMON, Common, KNOTS};

@@ -330,11 +330,14 @@ mod tests {
     #[test]
     fn orbits_are_as_good_as_the_receiver_and_hovering_needs_stereo() {
         let orbit = |gnss| horizontal_sigma(Kind::Orbit, 50.0, gnss, false).unwrap();
-        assert!((1.7..2.3).contains(&orbit(Gnss::Consumer)));
-        assert!(orbit(Gnss::Rtk) < 0.5);
+        let consumer = orbit(Gnss::Consumer);
+        assert!((1.5..2.2).contains(&consumer), "{consumer}");
+        let rtk = orbit(Gnss::Rtk);
+        assert!(rtk < 0.5, "{rtk}");
         let hover = |stereo| horizontal_sigma(Kind::Hover, 50.0, Gnss::Rtk, stereo);
-        assert!(hover(false).is_none_or(|sigma| sigma > 5.0));
-        assert!(hover(true).unwrap() < 5.0);
+        // Swaying by 0.3 m is all the parallax there is.
+        let (mono, stereo) = (hover(false).unwrap_or(f64::INFINITY), hover(true).unwrap());
+        assert!(mono > stereo && stereo < 4.0, "{mono} {stereo}");
     }
 
     #[test]
@@ -349,6 +352,6 @@ mod tests {
             let bound = bound(&lens, &errors, &flame, &looks[..count], None).unwrap();
             bound.trace()
         };
-        assert!(sigma(10) >= sigma(20) && sigma(20) >= sigma(30));
+        assert!(sigma(10) >= sigma(15) && sigma(15) >= sigma(20));
     }
 }
