@@ -4,6 +4,7 @@ use super::scene::Scene;
 use super::{
     Disparity, Method, Methods, Miss, RangeConfig, Refusal, centroid, correlate, cross_spectral,
 };
+use emberfix_calib::RectifiedPixel;
 
 /// One method's disparity.
 #[derive(Debug, Clone, Copy)]
@@ -128,14 +129,22 @@ fn trusted_alone(
 fn weighed(voices: &[Voice]) -> (Disparity, Methods) {
     let weight = |voice: &Voice| voice.found.sigma_px.powi(-2);
     let sum: f64 = voices.iter().map(weight).sum();
-    let px = voices.iter().map(|v| weight(v) * v.found.px).sum::<f64>() / sum;
+    let mean = |value: fn(&Disparity) -> f64| {
+        let weighted = |voice: &Voice| weight(voice) * value(&voice.found);
+        voices.iter().map(weighted).sum::<f64>() / sum
+    };
     let used = voices
         .iter()
         .map(|voice| Methods::only(voice.method))
         .fold(Methods::default(), Methods::with);
     let found = Disparity {
-        px,
+        px: mean(|found| found.px),
         sigma_px: (voices.len() as f64 / sum).sqrt(),
+        // Each voice speaks of its own rows, so their mean speaks of the mean row.
+        centroid: RectifiedPixel {
+            u: mean(|found| found.centroid.u),
+            v: mean(|found| found.centroid.v),
+        },
         ..voices[0].found
     };
     (found, used)

@@ -7,6 +7,7 @@
 
 use super::correlate::{disparity, rival_free};
 use super::patch::{Area, Gray};
+use super::refine::Refined;
 use super::scene::{Mask, Scene};
 use super::search::correlate;
 use super::{Disparity, RangeConfig, Refusal};
@@ -18,6 +19,8 @@ struct Levels {
     high: f32,
 }
 
+/// One pixel in so many tells the levels; no divisor of usual widths, so that it does not walk a column.
+const SAMPLED: usize = 7;
 /// Less contrast than this between flame and background is none, grey levels.
 const LEAST_CONTRAST: f32 = 16.0;
 /// Half the width of the soft edge, as a share of the contrast.
@@ -51,7 +54,12 @@ pub(super) fn find(scene: &Scene<'_>, config: &RangeConfig) -> Result<Disparity,
     let best = rival_free(&curve, LEAST_LIKENESS, -scene.search.greatest)?;
     let bands = bands(&left, &right, &bright, best.at);
     let (px, sigma_px) = scatter(&bands).ok_or(Refusal::TooSmall)?;
-    Ok(disparity(&bright, px, sigma_px))
+    let refined = Refined {
+        disparity_px: px,
+        sigma_px,
+        at: bright.centroid(),
+    };
+    Ok(disparity(&bright, &refined, 1.0))
 }
 
 /// How much each pixel belongs to what is as bright as the `pixels` brightest, 0 to 255.
@@ -68,8 +76,8 @@ fn covered(gray: &Gray, pixels: usize) -> Option<Gray> {
 
 /// About the middle between the background's median and that of the brightest `pixels`.
 fn levels(gray: &Gray, pixels: usize) -> Option<Levels> {
-    let mut sorted = gray.values.clone();
-    let count = sorted.len();
+    let mut sorted: Vec<f32> = gray.values.iter().step_by(SAMPLED).copied().collect();
+    let (count, pixels) = (sorted.len(), pixels / SAMPLED);
     let rank = count.checked_sub(pixels / 2 + 1)?;
     let bright = *sorted.select_nth_unstable_by(rank, f32::total_cmp).1;
     let rest = count.saturating_sub(pixels) / 2;

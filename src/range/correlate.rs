@@ -1,7 +1,7 @@
 //! Matching all pixels of a target as one: normalised correlation over the whole search, then least
 //! squares below the pixel.
 
-use super::refine::Refiner;
+use super::refine::{Refined, Refiner};
 use super::scene::{Mask, Run, Scene};
 use super::search::{Curve, Peak, correlate};
 use super::{Disparity, Miss, RangeConfig, Refusal};
@@ -45,11 +45,7 @@ pub(super) fn find(scene: &Scene<'_>, config: &RangeConfig) -> Result<Correlated
         .ok_or(Refusal::Inconsistent)?;
     let unlike = 1.0 + UNLIKE * (1.0 - peak.correlation);
     Ok(Correlated {
-        found: disparity(
-            &scene.flame,
-            refined.disparity_px,
-            unlike * refined.sigma_px,
-        ),
+        found: disparity(&scene.flame, &refined, unlike),
         likeness: peak.correlation,
     })
 }
@@ -93,13 +89,15 @@ fn there_and_back(scene: &Scene<'_>, runs: &[Run], peak: &Peak) -> Result<(), Mi
     }
 }
 
-/// A disparity with the flame that it is of.
-pub(super) fn disparity(flame: &Mask, px: f64, sigma_px: f64) -> Disparity {
-    let (u, v) = flame.centroid();
+/// A disparity with the flame that it is of; its sigma is widened by a factor.
+pub(super) fn disparity(flame: &Mask, refined: &Refined, widened: f64) -> Disparity {
     Disparity {
-        px,
-        sigma_px,
+        px: refined.disparity_px,
+        sigma_px: widened * refined.sigma_px,
         support: flame.count() as u32,
-        centroid: RectifiedPixel { u, v },
+        centroid: RectifiedPixel {
+            u: refined.at.0,
+            v: refined.at.1,
+        },
     }
 }

@@ -38,11 +38,7 @@ pub(super) fn find(scene: &Scene<'_>, config: &RangeConfig) -> Result<Disparity,
     let refined = Refiner::new(&left, &right, &runs, -best.at)
         .and_then(|refiner| refiner.refine())
         .ok_or(Refusal::Inconsistent)?;
-    Ok(disparity(
-        &scene.flame,
-        refined.disparity_px,
-        refined.sigma_px,
-    ))
+    Ok(disparity(&scene.flame, &refined, 1.0))
 }
 
 /// Magnitude of the gradient, through Sobel's masks.

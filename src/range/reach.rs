@@ -19,25 +19,18 @@ struct Honesty {
     /// What is seen of a flame is not just its axis, and a flame is about as deep as it is wide: one
     /// sigma of the difference, as a share of the disparity that its depth spans.
     depth: f64,
-    /// What its error leans to: an outline is seen where the flame is widest, at its axis or behind it,
-    /// its light before that. Share of the same depth by which the method reads too far.
-    behind: f64,
 }
 
 fn honesty(method: Method) -> Honesty {
-    let (scatter, depth, behind) = match method {
-        Method::Sgbm => (2.0, 0.10, 0.0),
-        Method::Centroid => (2.2, 0.10, 0.04),
-        Method::Correlate => (1.2, 0.10, 0.035),
-        Method::CrossSpectral => (1.5, 0.12, 0.06),
+    let (scatter, depth) = match method {
+        Method::Sgbm => (2.0, 0.10),
+        Method::Centroid => (2.2, 0.10),
+        Method::Correlate => (1.2, 0.10),
+        Method::CrossSpectral => (1.5, 0.12),
         // It is made of the others, whose sigmas are honest already.
-        Method::Best => (1.0, 0.0, 0.0),
+        Method::Best => (1.0, 0.0),
     };
-    Honesty {
-        scatter,
-        depth,
-        behind,
-    }
+    Honesty { scatter, depth }
 }
 
 /// A method's disparity with the sigma that its errors truly have, for a target of a width.
@@ -47,14 +40,9 @@ pub(super) fn honest(
     width_px: usize,
     focal_px: f64,
 ) -> Disparity {
-    let Honesty {
-        scatter,
-        depth,
-        behind,
-    } = honesty(method);
+    let Honesty { scatter, depth } = honesty(method);
     let depth_px = found.px.abs() * width_px as f64 / focal_px;
     Disparity {
-        px: found.px + behind * depth_px,
         sigma_px: (scatter * found.sigma_px).hypot(depth * depth_px),
         ..*found
     }

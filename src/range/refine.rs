@@ -14,6 +14,9 @@ use nalgebra::{Matrix3, Vector3};
 pub(super) struct Refined {
     pub disparity_px: f64,
     pub sigma_px: f64,
+    /// Where in the left eye it was learnt: mean column and row, weighted as the disparity is. What
+    /// stands upright is nearer at its top for a camera that looks down, so a disparity belongs to a row.
+    pub at: (f64, f64),
 }
 
 /// Both eyes, smoothed alike, about one whole disparity.
@@ -29,7 +32,7 @@ pub(super) struct Refiner {
 type State = Vector3<f64>;
 
 /// Pixels that are compared, at most: more of them no longer lower the error.
-const MOST_PIXELS: usize = 2500;
+const MOST_PIXELS: usize = 1800;
 /// Farthest that least squares may go from the whole pixel.
 const REACH_PX: f64 = 2.0;
 /// Columns beyond the target that interpolation and the way of the steps may need.
@@ -67,6 +70,7 @@ impl Refiner {
         let pooled = pooled(&self.parts(&whole)).unwrap_or(Refined {
             disparity_px: whole.state.x,
             sigma_px: whole.sigma_px,
+            at: whole.at,
         });
         Some(Refined {
             disparity_px: pooled.disparity_px + f64::from(self.start_px),
@@ -77,12 +81,14 @@ impl Refiner {
     fn together(&self) -> Option<Whole> {
         let mut state = State::new(0.0, 1.0, 0.0);
         let (mut scale, mut sigma_px) = (f64::INFINITY, f64::INFINITY);
+        let mut at = (0.0, 0.0);
         for _ in 0..MOST_STEPS {
-            let (normal, pull, residuals) = self.equations(&self.runs, &state, scale);
-            let inverse = normal.try_inverse()?;
-            let step = inverse * pull;
+            let equations = self.equations(&self.runs, &state, scale);
+            let inverse = equations.normal.try_inverse()?;
+            let step = inverse * equations.pull;
             state += step;
-            scale = robust_scale(residuals)?;
+            at = equations.at;
+            scale = robust_scale(equations.residuals)?;
             sigma_px = scale * WITNESS_FACTOR * inverse[(0, 0)].max(0.0).sqrt();
             if state.x.abs() > REACH_PX || !state.x.is_finite() {
                 return None;
@@ -96,17 +102,14 @@ impl Refiner {
             state,
             scale,
             sigma_px,
+            at,
         })
     }
 
     /// Normal equations of `left - gain * right(u - d) - offset`, weighted after Tukey.
-    fn equations(
-        &self,
-        runs: &[Run],
-        state: &State,
-        scale: f64,
-    ) -> (Matrix3<f64>, Vector3<f64>, Vec<f64>) {
+    fn equations(&self, runs: &[Run], state: &State, scale: f64) -> Equations {
         let mut n = [0.0_f64; 6];
+        let mut moment = (0.0, 0.0);
         let mut pull = Vector3::zeros();
         let mut residuals = Vec::with_capacity(MOST_PIXELS);
         let at = Between::new(-state.x);
@@ -122,7 +125,10 @@ impl Refiner {
                 // d(prediction) / d(disparity); the mean slope makes the step symmetric. By gain it is
                 // the value, by offset 1.
                 let shift = -0.5 * (state.y * slope + own_slope);
-                n[0] += weight * shift * shift;
+                let information = weight * shift * shift;
+                moment.0 += information * f64::from(column);
+                moment.1 += information * f64::from(run.row);
+                n[0] += information;
                 n[1] += weight * shift * value;
                 n[2] += weight * shift;
                 n[3] += weight * value * value;
@@ -132,7 +138,12 @@ impl Refiner {
             }
         }
         let normal = Matrix3::new(n[0], n[1], n[2], n[1], n[3], n[4], n[2], n[4], n[5]);
-        (normal, pull, residuals)
+        Equations {
+            normal,
+            pull,
+            residuals,
+            at: (moment.0 / n[0], moment.1 / n[0]),
+        }
     }
 
     /// Disparities of the cells of a raster over the target.
@@ -174,13 +185,14 @@ impl Refiner {
             return None;
         }
         let mut state = whole.state;
-        let mut sigma_px = f64::INFINITY;
+        let (mut sigma_px, mut at) = (f64::INFINITY, (0.0, 0.0));
         for _ in 0..MOST_PART_STEPS {
-            let (normal, pull, residuals) = self.equations(&runs, &state, 1.5 * whole.scale);
-            let slope2 = normal[(0, 0)];
-            let step = pull.x / slope2;
+            let equations = self.equations(&runs, &state, 1.5 * whole.scale);
+            let information = equations.normal[(0, 0)];
+            let step = equations.pull.x / information;
             state.x += step;
-            sigma_px = WITNESS_FACTOR * robust_scale(residuals)? / slope2.sqrt();
+            at = equations.at;
+            sigma_px = WITNESS_FACTOR * robust_scale(equations.residuals)? / information.sqrt();
             if !state.x.is_finite() || (state.x - whole.state.x).abs() > REACH_PX {
                 return None;
             }
@@ -191,8 +203,18 @@ impl Refiner {
         (sigma_px < WORST_PART_PX).then_some(Refined {
             disparity_px: state.x,
             sigma_px,
+            at,
         })
     }
+}
+
+/// Normal equations, and what the robust weights and the end need.
+struct Equations {
+    normal: Matrix3<f64>,
+    pull: Vector3<f64>,
+    residuals: Vec<f64>,
+    /// Mean column and row by information on the disparity.
+    at: (f64, f64),
 }
 
 /// What all pixels together say.
@@ -201,6 +223,7 @@ struct Whole {
     /// Robust standard deviation of the residuals, grey levels.
     scale: f64,
     sigma_px: f64,
+    at: (f64, f64),
 }
 
 const MOST_PARTS: f64 = 36.0;
@@ -231,24 +254,28 @@ fn pooled(parts: &[Refined]) -> Option<Refined> {
         )?;
     let noise = median(parts.iter().map(|part| part.sigma_px).collect())?;
     let between = (spread.powi(2) - noise.powi(2)).max(0.0);
-    let mut sigma_px = f64::NAN;
+    let (mut sigma_px, mut at) = (f64::NAN, (0.0, 0.0));
     for _ in 0..5 {
-        let (mut w, mut wd, mut wr) = (0.0, 0.0, 0.0);
+        let (mut w, mut wd, mut wr, mut wu, mut wv) = (0.0, 0.0, 0.0, 0.0, 0.0);
         for part in parts {
             let variance = part.sigma_px.powi(2) + between;
             let apart = part.disparity_px - mean;
             if apart.powi(2) < OUTLIER_SIGMAS.powi(2) * variance {
                 w += 1.0 / variance;
                 wd += part.disparity_px / variance;
+                wu += part.at.0 / variance;
+                wv += part.at.1 / variance;
                 wr += (apart / variance).powi(2);
             }
         }
         mean = wd / w;
+        at = (wu / w, wv / w);
         sigma_px = wr.sqrt().max(w.sqrt()) / w;
     }
     sigma_px.is_finite().then_some(Refined {
         disparity_px: mean,
         sigma_px,
+        at,
     })
 }
 
@@ -358,4 +385,84 @@ fn robust_scale(mut residuals: Vec<f64>) -> Option<f64> {
     let (_, median, _) = residuals.select_nth_unstable_by(middle, f64::total_cmp);
     // Quantisation alone leaves 0.3 grey levels.
     Some((*median * 1.4826).max(0.3))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const AREA: Area = Area {
+        left: 0,
+        top: 0,
+        right: 60,
+        bottom: 20,
+    };
+
+    fn wave(shift: f64) -> Gray {
+        let value = |k: i32| {
+            let (u, v) = (f64::from(k % 60) + shift, f64::from(k / 60));
+            (120.0 + 60.0 * (0.7 * u + 0.3 * v).sin() + 30.0 * (0.31 * u - v).cos()) as f32
+        };
+        Gray {
+            area: AREA,
+            seen: (0, 60),
+            values: (0..60 * 20).map(value).collect(),
+        }
+    }
+
+    fn runs() -> Vec<Run> {
+        (0..20)
+            .map(|row| Run {
+                row,
+                from: 20,
+                to: 50,
+            })
+            .collect()
+    }
+
+    #[test]
+    fn a_shift_is_found_to_a_hundredth_of_a_pixel_whatever_gain_and_offset() {
+        for step in 0..8 {
+            let truth = 6.0 + 0.125 * f64::from(step);
+            let mut right = wave(truth);
+            for value in &mut right.values {
+                *value = 0.7 * *value + 20.0;
+            }
+            let refiner = Refiner::new(&wave(0.0), &right, &runs(), 6).unwrap();
+            let found = refiner.refine().unwrap();
+            assert!(
+                (found.disparity_px - truth).abs() < 0.01,
+                "{found:?} {truth}"
+            );
+            assert!(found.sigma_px < 0.02, "{found:?}");
+        }
+    }
+
+    #[test]
+    fn a_flat_eye_has_no_disparity() {
+        let flat = Gray {
+            values: vec![80.0; 60 * 20],
+            ..wave(0.0)
+        };
+        let refiner = Refiner::new(&flat, &flat, &runs(), 5).unwrap();
+        assert_eq!(refiner.refine(), None);
+    }
+
+    #[test]
+    fn parts_behind_the_flame_do_not_count_and_scatter_is_stated() {
+        let part = |disparity_px| Refined {
+            disparity_px,
+            sigma_px: 0.02,
+            at: (1.0, 2.0),
+        };
+        let mut parts: Vec<Refined> = (0..9)
+            .map(|k| part(5.0 + 0.01 * f64::from(k % 3)))
+            .collect();
+        let tight = pooled(&parts).unwrap();
+        parts.extend([part(3.0), part(3.1)]);
+        let found = pooled(&parts).unwrap();
+        assert!((found.disparity_px - 5.01).abs() < 0.01, "{found:?}");
+        let wide: Vec<Refined> = (0..9).map(|k| part(5.0 + 0.3 * f64::from(k % 3))).collect();
+        assert!(pooled(&wide).unwrap().sigma_px > 5.0 * tight.sigma_px);
+    }
 }

@@ -18,8 +18,8 @@ pub(super) struct Peak {
     pub correlation: f64,
 }
 
-/// Rows that are compared, at most: more of them change the whole pixel no longer.
-const MOST_PIXELS: usize = 1600;
+/// Pixels that are compared, about, at most: more of them change the whole pixel no longer.
+const MOST_PIXELS: usize = 900;
 
 /// Correlates the runs' pixels of `one` with those of `other` that lie `offset` columns further on.
 pub(super) fn correlate(
@@ -138,5 +138,55 @@ impl Curve {
             .collect();
         peaks.sort_by(|a, b| b.correlation.total_cmp(&a.correlation));
         peaks
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::range::patch::Area;
+
+    fn gray(values: Vec<f32>) -> Gray {
+        Gray {
+            area: Area {
+                left: 100,
+                top: 7,
+                right: 180,
+                bottom: 8,
+            },
+            seen: (100, 180),
+            values,
+        }
+    }
+
+    const RUN: [Run; 1] = [Run {
+        row: 7,
+        from: 140,
+        to: 160,
+    }];
+
+    fn texture(shift: i32, gain: f32) -> Gray {
+        let value = |k: i32| {
+            let k = k + shift;
+            128.0 + gain * ((k * k * 37 % 101) - 50) as f32
+        };
+        gray((0..80).map(value).collect())
+    }
+
+    #[test]
+    fn the_best_peak_is_where_the_same_stands_whatever_the_gain() {
+        let curve = correlate(&texture(0, 1.0), &texture(9, 0.4), &RUN, -20..=3);
+        let best = curve.peaks()[0];
+        assert_eq!(best.at, -9);
+        assert!(best.correlation > 0.999, "{best:?}");
+    }
+
+    #[test]
+    fn nothing_flat_and_nothing_outside_of_the_image_correlates() {
+        let flat = gray(vec![90.0; 80]);
+        let curve = correlate(&texture(0, 1.0), &flat, &RUN, -20..=3);
+        assert!(curve.values.iter().all(|value| value.is_nan()));
+        let curve = correlate(&texture(0, 1.0), &texture(0, 1.0), &RUN, -70..=-60);
+        assert!(curve.peaks().is_empty());
     }
 }

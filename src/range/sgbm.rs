@@ -1,11 +1,11 @@
 //! Semi-global matching per pixel in the padded box, pooled under the flame's mask (P3, P4).
 
-use super::correlate::disparity;
 use super::patch::Gray;
 use super::pool::{Pooled, Sample, pool};
 use super::scene::{Mask, Scene, Search};
 use super::search::correlate;
 use super::{Disparity, Miss, RangeConfig, RangeError, Refusal};
+use emberfix_calib::RectifiedPixel;
 use opencv::calib3d::{StereoSGBM, StereoSGBM_MODE_SGBM};
 use opencv::core::{Mat, MatTraitConst, Ptr};
 use opencv::prelude::StereoMatcherTrait;
@@ -41,14 +41,14 @@ impl SemiGlobal {
         let block = f64::from(config.block_px * config.block_px);
         let witnesses = (f64::from(pooled.support) / block).max(1.0);
         let sigma_px = (pooled.spread_px / witnesses.sqrt()).hypot(LOCKING_PX);
-        let found = disparity(&scene.flame, pooled.disparity_px, sigma_px);
         Ok(Disparity {
+            px: pooled.disparity_px,
+            sigma_px,
             support: pooled.support,
-            centroid: emberfix_calib::RectifiedPixel {
+            centroid: RectifiedPixel {
                 u: pooled.centroid.0,
                 v: pooled.centroid.1,
             },
-            ..found
         })
     }
 

@@ -11,6 +11,10 @@ const FOCAL_PX: f64 = 500.0;
 const BASELINE_M: f64 = 0.1;
 
 fn rig() -> Rig {
+    Rig::load(rig_file().path()).unwrap()
+}
+
+fn rig_file() -> tempfile::NamedTempFile {
     let camera = format!(
         "image_size_px = [{WIDTH}, {HEIGHT}]\nfocal_px = [{FOCAL_PX}, {FOCAL_PX}]\n\
          principal_point_px = [179.5, 99.5]\ndistortion = [0.0, 0.0, 0.0, 0.0, 0.0]\n"
@@ -25,7 +29,7 @@ fn rig() -> Rig {
     );
     let file = tempfile::NamedTempFile::new().unwrap();
     std::fs::write(file.path(), text).unwrap();
-    Rig::load(file.path()).unwrap()
+    file
 }
 
 /// Smooth noise of a few pixels' grain, defined between pixels as well: a sum of waves.
@@ -208,6 +212,124 @@ fn a_point_in_front_has_a_positive_disparity_and_the_printed_forms_fail() {
         printed_reverse < -9.0,
         "E2 puts it behind the camera at {printed_reverse} m"
     );
+}
+
+#[test]
+fn every_way_finds_the_flame_and_says_that_it_did() {
+    for method in Method::ALL {
+        let Ranging::Measured {
+            disparity_px,
+            sigma_px,
+            used,
+            ..
+        } = measure(&SCENE, method)
+        else {
+            panic!("{} did not measure", method.name());
+        };
+        let off = (disparity_px - SCENE.flame_px).abs();
+        assert!(
+            off < 3.0 * sigma_px && off < 0.4,
+            "{}: {disparity_px} +- {sigma_px}",
+            method.name()
+        );
+        let said = match method {
+            Method::Best => used.contains(Method::Correlate),
+            _ => used == Methods::only(method),
+        };
+        assert!(said, "{}: {used}", method.name());
+    }
+}
+
+/// What a near-infrared eye makes of it: bright where the visible one is dark.
+#[test]
+fn the_cross_spectral_way_survives_reversed_contrast_and_grey_levels_do_not() {
+    let mut pair = SCENE.pair();
+    let mut reversed = Mat::default();
+    opencv::core::bitwise_not_def(&pair.right_gray.unwrap(), &mut reversed).unwrap();
+    pair.right_gray = Some(reversed);
+    let range = |method| ranger(method).range(&pair, &SCENE.target()).unwrap();
+    assert!(matches!(range(Method::Correlate), Ranging::NoMatch { .. }));
+    // Census bits flip as well; only their share tells, and gradients stay.
+    let found = range(Method::CrossSpectral);
+    if let Ranging::Measured { disparity_px, .. } = found {
+        assert!((disparity_px - SCENE.flame_px).abs() < 0.4, "{found:?}");
+    }
+}
+
+/// A mirror image of the same flame beside it in the right eye alone.
+#[test]
+fn two_places_that_look_alike_are_refused_by_name() {
+    let mut pair = SCENE.pair();
+    let right = pair.right_gray.take().unwrap();
+    let mut doubled = right.clone();
+    for v in 60..140 {
+        for u in 140..210 {
+            *doubled.at_2d_mut::<u8>(v, u - 70).unwrap() =
+                *opencv::prelude::MatTraitConst::at_2d::<u8>(&right, v, u).unwrap();
+        }
+    }
+    pair.right_gray = Some(doubled);
+    let found = ranger(Method::Best).range(&pair, &SCENE.target()).unwrap();
+    assert_eq!(
+        found,
+        Ranging::NoMatch {
+            why: Refusal::Ambiguous
+        }
+    );
+}
+
+/// The left eye sees two flames alike, the right one only the other: its picture fits ours too, which
+/// would put ours near.
+#[test]
+fn a_partner_that_belongs_to_another_flame_is_no_phantom() {
+    let near = |found: &Ranging| matches!(found, Ranging::Measured { disparity_px, .. } if *disparity_px > 20.0);
+    let mut pair = SCENE.pair();
+    let own = pair.left_bgr.clone();
+    for v in 40..160 {
+        for u in 140..220 {
+            let pixel = *opencv::prelude::MatTraitConst::at_2d::<Vec3b>(&own, v, u).unwrap();
+            *pair.left_bgr.at_2d_mut::<Vec3b>(v, u - 90).unwrap() = pixel;
+        }
+    }
+    let mut right = pair.right_gray.take().unwrap();
+    let whole = right.clone();
+    for v in 40..160 {
+        for u in 130..220 {
+            let ground = *opencv::prelude::MatTraitConst::at_2d::<u8>(&whole, v, u - 100).unwrap();
+            let flame = *opencv::prelude::MatTraitConst::at_2d::<u8>(&whole, v, u).unwrap();
+            *right.at_2d_mut::<u8>(v, u - 90).unwrap() = flame;
+            *right.at_2d_mut::<u8>(v, u).unwrap() = ground;
+        }
+    }
+    pair.right_gray = Some(right);
+    for method in [Method::Correlate, Method::Best] {
+        let found = ranger(method).range(&pair, &SCENE.target()).unwrap();
+        assert!(!near(&found), "{}: {found:?}", method.name());
+    }
+}
+
+#[test]
+fn a_rigs_inverse_depth_correction_is_applied_once_to_disparities() {
+    let plain = rig();
+    let text = std::fs::read_to_string(rig_file().path()).unwrap();
+    let corrected = emberfix_calib::InverseDepth {
+        scale: 0.98,
+        offset_per_m: -0.004,
+        covariance: [1e-6, 0.0, 1e-8],
+    };
+    let text = corrected.written_into(&text);
+    let other = Rig::parse(&text, Path::new("corrected")).unwrap();
+    let depth = |rig: &Rig| {
+        let found = open(Method::Correlate, rig, &RangeConfig::default())
+            .unwrap()
+            .range(&SCENE.pair(), &SCENE.target())
+            .unwrap();
+        rig.depth_m(disparity(found)).unwrap()
+    };
+    let (before, after) = (depth(&plain), depth(&other));
+    let want = 1.0 / corrected.corrected_per_m(1.0 / before);
+    assert!((after - want).abs() < 1e-9, "{before} {after} {want}");
+    assert!(after < before, "it read too far");
 }
 
 #[test]
