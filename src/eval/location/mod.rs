@@ -30,7 +30,7 @@ use flight::Kind;
 use incidents::Incidents;
 use indicatif::ProgressBar;
 use law::Law;
-use monte_carlo::{Case, Flown, fly};
+use monte_carlo::{Beside, Case, Flown, fly};
 use mount::MountFlown;
 use p3::P3Flown;
 use rand_chacha::ChaCha8Rng;
@@ -58,6 +58,9 @@ pub struct Options {
     /// Ways to fly.
     pub kinds: Vec<Kind>,
 }
+
+/// One flight in so many (prime to the classes' turns) is solved all at once as well.
+const AT_ONCE: usize = 7;
 
 /// Everything that was flown.
 #[derive(Debug, Clone)]
@@ -116,7 +119,13 @@ impl Options {
     /// [`SetupError`] when a rig is refused.
     pub fn fly(&self, law: Law, count: usize, bar: &ProgressBar) -> Result<Vec<Flown>, SetupError> {
         self.each(&format!("{law:?}"), count, bar, |index, rng| {
-            fly(Case::drawn(rng, &self.kinds, index), law, self.errors, rng)
+            let beside = match law {
+                Law::Assumed if index / self.kinds.len() % AT_ONCE == 0 => Beside::AllAtOnce,
+                Law::Assumed => Beside::Bound,
+                _ => Beside::Nothing,
+            };
+            let case = Case::drawn(rng, &self.kinds, index);
+            fly(case, law, self.errors, beside, rng)
         })
     }
 

@@ -65,6 +65,7 @@ pub(super) fn report(options: &Options, campaign: &Campaign) -> Report {
                 "heading_deg": [0.5, 1.0, 2.0],
             },
             "cells": &cells,
+            "worst": least_honest(&campaign.flown),
             "kinds": kinds(&campaign.flown),
             "laws": &laws,
             "p3": p3,
@@ -81,6 +82,18 @@ pub(super) fn report(options: &Options, campaign: &Campaign) -> Report {
         plots: plots::plots(&campaign.flown, &cells, &laws),
     }
 }
+
+/// The flights whose last alarm was the least honest: where to look first.
+fn least_honest(flown: &[Flown]) -> Vec<&Flown> {
+    let nees = |f: &Flown| f.last.map_or(0.0, |last| last.nees);
+    let mut worst: Vec<&Flown> = flown.iter().collect();
+    worst.sort_by(|a, b| nees(b).total_cmp(&nees(a)));
+    worst.truncate(WORST);
+    worst
+}
+
+/// How many of them are shown.
+const WORST: usize = 30;
 
 /// Tables of the parts that were flown.
 fn tables(campaign: &Campaign, cells: &[Cell], laws: &[LawRow]) -> Vec<Table> {
