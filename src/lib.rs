@@ -12,9 +12,11 @@
 
 pub mod alarm;
 pub mod assess;
+pub mod boresight;
 pub mod cli;
 pub mod deliver;
 pub mod detect;
+pub mod doctor;
 pub mod eval;
 pub mod ground;
 pub mod ingest;

@@ -64,6 +64,8 @@ pub struct Mission {
     pub uav: String,
     /// The stereo rig.
     pub rig: Arc<Rig>,
+    /// The file that it stands in.
+    pub rig_path: PathBuf,
     /// Origin of the mission's tangent plane.
     pub datum: Wgs84,
     /// MAVLink system of the vehicle; 0 takes the first autopilot that is heard.
@@ -529,6 +531,7 @@ fn build(raw: RawMission, path: &Path) -> Result<Mission, MissionError> {
         },
         name: raw.name,
         uav: raw.uav,
+        rig_path: beside(&raw.rig),
         rig: Arc::new(rig),
         datum,
         system_id: raw.vehicle.system_id,

@@ -208,6 +208,7 @@ fn record_images(tape: &mut Tape, set: &Path, count: usize) {
             at,
         };
         let value = StereoPair {
+            spectra: Vec::new(),
             sequence: sequence as u64,
             arrived: at + SignedDuration::from_millis(30),
             left: eye("image_l"),

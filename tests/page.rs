@@ -22,12 +22,23 @@ use support::Said;
 const FIRE: &str = r#"{"type": "Feature",
     "geometry": {"type": "Point", "coordinates": [119.1120167, 31.4094222, 11.06]},
     "properties": {"id": "uav-1-7", "revision": 1, "uav": "uav-1", "class": "fire",
-        "state": "confirmed", "confidence": 0.95,
+        "state": "growing", "confidence": 0.95,
         "first_seen_at": "2026-03-01T04:00:10.000000000Z",
         "captured_at": "2026-03-01T04:00:14.000000000Z",
         "altitude_msl_m": 8.7067, "height_above_ground_m": 0.1, "ce90_m": 3.2, "le90_m": 4.1,
         "covariance_enu_m2": [2.25, 0, 0, 0, 2.25, 0, 0, 0, 6.25], "methods": ["stereo"],
-        "sightings": 9, "range_m": 21.5, "size_m": null, "trend": null, "degraded": []}}"#;
+        "sightings": 9, "range_m": 21.5, "size_m": {"width": 6.2, "height": 2.1},
+        "size_sigma_m": {"width": 0.6, "height": 0.5}, "size_class": "large",
+        "trend": 0.031, "trend_sigma": 0.008, "trend_probability": {"growing": 0.99, "dying": 0.0},
+        "intensity": {"value": 2.1, "sigma": 0.2},
+        "intensity_history": [[-20, 1.0], [-15, 1.1], [-10, 1.3], [-5, 1.7], [0, 2.1]],
+        "area": {"polygon": [[119.11198, 31.40941], [119.11204, 31.40941], [119.11206, 31.40944],
+            [119.11204, 31.40947], [119.11198, 31.40947], [119.11197, 31.40944]],
+            "edge_sigma_m": 0.7, "square_metres": {"value": 38.0, "sigma": 7.0},
+            "front": [[119.11204, 31.40941], [119.11206, 31.40944], [119.11204, 31.40947]]},
+        "spread": {"azimuth_deg": {"value": 92.0, "sigma": 8.0},
+            "speed_m_s": {"value": 0.21, "sigma": 0.04}, "used_wind": true},
+        "degraded": []}}"#;
 
 #[test]
 fn a_browser_sees_the_fire_and_asks_no_other_server() {
@@ -55,6 +66,14 @@ fn a_browser_sees_the_fire_and_asks_no_other_server() {
         "uav-1-7",
         "--expect",
         "31.409422, 119.112017",
+        "--expect",
+        "large: 6.2 m ± 0.6 m wide, 2.1 m ± 0.5 m high",
+        "--expect",
+        "to the east (092° ± 8°), 0.21 ± 0.04 m/s",
+        "--expect",
+        "Intensity over 20 s: now 2.1 times what it was",
+        "--eval",
+        "document.querySelectorAll('.mark .front').length",
     ]);
     let said = Said::of(&browser.output().unwrap());
     drop(ground);

@@ -1,8 +1,9 @@
 //! The rig file: raw TOML to a checked [`Rig`], every problem at once.
 
+use crate::inverse_depth::{OFFSETS_PER_M, SCALES};
 use crate::{
-    Calibrated, Camera, Checks, Finding, KeyProblem, Rectification, Rig, RigSigmas, Severity,
-    implausible, toml_problem, unknown_keys,
+    Calibrated, Camera, Checks, Finding, InverseDepth, KeyProblem, Rectification, Rig, RigSigmas,
+    Severity, implausible, toml_problem, unknown_keys,
 };
 use emberfix_frames::{Metres, MountAngles, Vector, Vector3};
 use serde::Deserialize;
@@ -54,6 +55,8 @@ struct RawRig {
     mount: RawMount,
     time: RawTime,
     sigma: RawSigma,
+    #[serde(default)]
+    inverse_depth: RawInverseDepth,
     calibrated: Option<RawCalibrated>,
 }
 
@@ -96,6 +99,25 @@ struct RawSigma {
 }
 
 #[derive(Deserialize)]
+#[serde(default)]
+struct RawInverseDepth {
+    scale: f64,
+    offset_per_m: f64,
+    covariance: [f64; 3],
+}
+
+impl Default for RawInverseDepth {
+    fn default() -> Self {
+        let plain = InverseDepth::default();
+        Self {
+            scale: plain.scale,
+            offset_per_m: plain.offset_per_m,
+            covariance: plain.covariance,
+        }
+    }
+}
+
+#[derive(Deserialize)]
 struct RawCalibrated {
     at: String,
     pairs: usize,
@@ -127,6 +149,9 @@ const KNOWN: &[&str] = &[
     "sigma.boresight_deg",
     "sigma.lever_arm_m",
     "sigma.time_offset_s",
+    "inverse_depth.scale",
+    "inverse_depth.offset_per_m",
+    "inverse_depth.covariance",
     "calibrated.at",
     "calibrated.pairs",
     "calibrated.rms_px",
@@ -216,7 +241,25 @@ fn check(raw: &RawRig) -> Vec<String> {
     checks.range("sigma.boresight_deg", sigma.boresight_deg, 0.0, 45.0, "");
     checks.range("sigma.lever_arm_m", sigma.lever_arm_m, 0.0, 5.0, "");
     checks.range("sigma.time_offset_s", sigma.time_offset_s, 0.0, 2.0, "");
+    check_inverse_depth(&mut checks, &raw.inverse_depth);
     checks.into_problems()
+}
+
+fn check_inverse_depth(checks: &mut Checks, raw: &RawInverseDepth) {
+    let (scales, offsets) = (SCALES, OFFSETS_PER_M);
+    checks.range("inverse_depth.scale", raw.scale, scales.0, scales.1, "");
+    checks.range(
+        "inverse_depth.offset_per_m",
+        raw.offset_per_m,
+        offsets.0,
+        offsets.1,
+        "",
+    );
+    let [scale, both, offset] = raw.covariance;
+    checks.range("inverse_depth.covariance[0]", scale, 0.0, 1.0, "");
+    checks.range("inverse_depth.covariance[2]", offset, 0.0, 1.0, "");
+    let most = (scale * offset).max(0.0).sqrt() * (1.0 + 1e-2);
+    checks.range("inverse_depth.covariance[1]", both, -most, most, "");
 }
 
 fn check_camera(checks: &mut Checks, eye: &str, camera: &RawCamera) {
@@ -336,8 +379,14 @@ fn build(raw: RawRig, path: &Path) -> Result<Rig, RigError> {
             source,
         })?;
     let findings = implausible(&left, &right, &rectification, &translation_m);
-    if findings.iter().any(|found| found.severity == Severity::Refusal) {
-        return Err(values(path, findings.iter().map(Finding::to_string).collect()));
+    if findings
+        .iter()
+        .any(|found| found.severity == Severity::Refusal)
+    {
+        return Err(values(
+            path,
+            findings.iter().map(Finding::to_string).collect(),
+        ));
     }
     Ok(Rig {
         name: raw.name,
@@ -359,6 +408,11 @@ fn build(raw: RawRig, path: &Path) -> Result<Rig, RigError> {
             boresight_rad: raw.sigma.boresight_deg.to_radians(),
             lever_arm_m: raw.sigma.lever_arm_m,
             time_offset_s: raw.sigma.time_offset_s,
+        },
+        inverse_depth: InverseDepth {
+            scale: raw.inverse_depth.scale,
+            offset_per_m: raw.inverse_depth.offset_per_m,
+            covariance: raw.inverse_depth.covariance,
         },
         rectification,
         calibrated: raw.calibrated.map(calibrated),

@@ -10,6 +10,7 @@
 
 pub mod exchange;
 mod file;
+mod inverse_depth;
 mod nearest;
 mod page;
 mod parts;
@@ -20,6 +21,7 @@ pub mod solve;
 mod tests;
 
 pub use file::RigError;
+pub use inverse_depth::{InverseDepth, InverseDepthError, Reading};
 pub use nearest::{Checks, KeyProblem, nearest_key, toml_problem, unknown_keys};
 pub use page::{PageInput, page};
 pub use parts::{Calibrated, Mounting, RigParts, mount_angles};
@@ -100,6 +102,7 @@ pub struct Rig {
     rolling_readout_s: f64,
     max_skew_s: f64,
     sigmas: RigSigmas,
+    inverse_depth: InverseDepth,
     rectification: Rectification,
     calibrated: Option<Calibrated>,
     doubts: Vec<Finding>,
@@ -219,6 +222,35 @@ impl Rig {
     pub fn disparity_px(&self, depth_m: f64) -> f64 {
         let rect = &self.rectification;
         rect.focal_px() * self.baseline_m() / depth_m + rect.infinity_disparity_px()
+    }
+
+    /// What known distances said of this rig.
+    #[must_use]
+    pub fn inverse_depth(&self) -> &InverseDepth {
+        &self.inverse_depth
+    }
+
+    /// Disparity that stands for the true depth, from a measured one, both rectified pixels. Whoever
+    /// measures applies it once; [`Rig::depth_m`] expects it.
+    #[must_use]
+    pub fn corrected_disparity_px(&self, measured_px: f64) -> f64 {
+        let rect = &self.rectification;
+        let (focal_baseline, infinity) = (
+            rect.focal_px() * self.baseline_m(),
+            rect.infinity_disparity_px(),
+        );
+        let measured_per_m = (measured_px - infinity) / focal_baseline;
+        focal_baseline * self.inverse_depth.corrected_per_m(measured_per_m) + infinity
+    }
+
+    /// One sigma of the disparity offset that calibration leaves at a corrected disparity, pixels.
+    #[must_use]
+    pub fn disparity_bias_sigma_px(&self, corrected_px: f64) -> f64 {
+        let rect = &self.rectification;
+        let focal_baseline = rect.focal_px() * self.baseline_m();
+        let per_m = (corrected_px - rect.infinity_disparity_px()) / focal_baseline;
+        let left = focal_baseline * self.inverse_depth.sigma_per_m(per_m);
+        self.sigmas.disparity_bias_px.hypot(left)
     }
 
     /// Direction of a rectified left pixel: metres in [`CamLeft`] per metre of depth.

@@ -104,10 +104,12 @@ fn over_fit(eye: &str, camera: &Camera) -> Option<Finding> {
 fn folded(eye: &str, camera: &Camera) -> Option<Finding> {
     let [k1, k2, _, _, k3] = camera.distortion;
     let farthest = farthest_radius(camera);
-    let turns_back = (1..=200).map(|step| farthest * f64::from(step) / 200.0).find(|r| {
-        let r2 = r * r;
-        1.0 + r2 * (3.0 * k1 + r2 * (5.0 * k2 + r2 * 7.0 * k3)) <= 0.0
-    })?;
+    let turns_back = (1..=200)
+        .map(|step| farthest * f64::from(step) / 200.0)
+        .find(|r| {
+            let r2 = r * r;
+            1.0 + r2 * (3.0 * k1 + r2 * (5.0 * k2 + r2 * 7.0 * k3)) <= 0.0
+        })?;
     let angle_deg = turns_back.atan().to_degrees();
     Some(Finding::doubt(format!(
         "{eye}.distortion folds the image over at {angle_deg:.0} degrees from the boresight, inside \

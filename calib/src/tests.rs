@@ -228,7 +228,10 @@ fn the_rig_that_p4_printed_is_refused_and_every_reason_is_told() {
     // Straightened, it may fly, and the doubts stay.
     let straight = P4_TABLE_1.replace("-0.01497943", "0.0");
     let doubts = parse(&straight).unwrap().doubts().to_vec();
-    assert!(doubts.iter().any(|doubt| doubt.sentence.contains("k3")), "{doubts:?}");
+    assert!(
+        doubts.iter().any(|doubt| doubt.sentence.contains("k3")),
+        "{doubts:?}"
+    );
 }
 
 #[test]

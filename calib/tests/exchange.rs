@@ -1,5 +1,7 @@
 //! Files of other programs: round trips lose nothing, broken ones are refused in one line.
 
+#![expect(clippy::unwrap_used, reason = "a test may stop at its first surprise")]
+
 use emberfix_calib::exchange::{
     Answers, Imported, ImuAxes, LengthUnit, export_opencv, export_ros, import,
 };
@@ -101,9 +103,15 @@ fn kalibr_brings_the_mount_and_the_time_shift() {
     assert_eq!(found.time_offset_s, Some(-0.0125));
     let (angles, arm) = found.mount.unwrap();
     // The shipped rig's mount: 30 degrees down, and its lever arm.
-    assert!((angles.depression_rad.to_degrees() - 30.0).abs() < 1e-9, "{angles:?}");
+    assert!(
+        (angles.depression_rad.to_degrees() - 30.0).abs() < 1e-9,
+        "{angles:?}"
+    );
     assert!(angles.yaw_rad.abs() < 1e-9 && angles.roll_rad.abs() < 1e-9);
-    assert!((arm - emberfix_frames::Vector3::new(0.12, -0.037, 0.06)).norm() < 1e-9, "{arm}");
+    assert!(
+        (arm - emberfix_frames::Vector3::new(0.12, -0.037, 0.06)).norm() < 1e-9,
+        "{arm}"
+    );
 }
 
 #[test]
@@ -111,16 +119,28 @@ fn the_same_camera_on_an_imu_with_ros_axes_has_the_same_mount() {
     let folder = tempfile::tempdir().unwrap();
     let flu = KALIBR
         .replace("[0.0, 1.0, 0.0, 0.037]", "[0.0, -1.0, 0.0, 0.037]")
-        .replace("[-0.5, 0.0, 0.8660254037844386, 0.0", "[-0.5, 0.0, -0.8660254037844386, 0.0")
-        .replace("[0.8660254037844386, 0.0, 0.5, -", "[0.8660254037844386, 0.0, -0.5, -");
+        .replace(
+            "[-0.5, 0.0, 0.8660254037844386, 0.0",
+            "[-0.5, 0.0, -0.8660254037844386, 0.0",
+        )
+        .replace(
+            "[0.8660254037844386, 0.0, 0.5, -",
+            "[0.8660254037844386, 0.0, -0.5, -",
+        );
     let answers = Answers {
         imu_axes: Some(ImuAxes::Flu),
         ..Answers::default()
     };
     let found = import(&[written(&folder, "flu.yaml", &flu)], answers).unwrap();
     let (angles, arm) = found.mount.unwrap();
-    assert!((angles.depression_rad.to_degrees() - 30.0).abs() < 1e-9, "{angles:?}");
-    assert!((arm - emberfix_frames::Vector3::new(0.12, -0.037, 0.06)).norm() < 1e-9, "{arm}");
+    assert!(
+        (angles.depression_rad.to_degrees() - 30.0).abs() < 1e-9,
+        "{angles:?}"
+    );
+    assert!(
+        (arm - emberfix_frames::Vector3::new(0.12, -0.037, 0.06)).norm() < 1e-9,
+        "{arm}"
+    );
 }
 
 const DEPTHAI: &str = r#"{
@@ -166,10 +186,17 @@ fn a_chain_of_sockets_is_followed_backwards_too() {
     let turned = DEPTHAI
         .replace("\"toCameraSocket\": 2", "\"toCameraSocket\": -1")
         .replace("\"toCameraSocket\": 0", "\"toCameraSocket\": 1")
-        .replace("\"translation\": {\"x\": 3.75", "\"translation\": {\"x\": 7.5");
+        .replace(
+            "\"translation\": {\"x\": 3.75",
+            "\"translation\": {\"x\": 7.5",
+        );
     let folder = tempfile::tempdir().unwrap();
     let found = import(&[written(&folder, "e.json", &turned)], Answers::default()).unwrap();
-    assert!((found.translation_m.x + 0.075).abs() < 1e-9, "{}", found.translation_m);
+    assert!(
+        (found.translation_m.x + 0.075).abs() < 1e-9,
+        "{}",
+        found.translation_m
+    );
 }
 
 fn opencv_text() -> String {
@@ -192,27 +219,95 @@ fn broken() -> Vec<(&'static str, String, &'static str)> {
     };
     vec![
         ("empty.yaml", String::new(), "neither a Kalibr"),
-        ("photo.yaml", "\u{1}\u{2}JFIF".to_owned(), "neither a Kalibr"),
+        (
+            "photo.yaml",
+            "\u{1}\u{2}JFIF".to_owned(),
+            "neither a Kalibr",
+        ),
         ("cut.yaml", KALIBR[..700].to_owned(), "cam"),
-        ("tab.yaml", kalibr("  T_cn", "\t T_cn"), "not readable as Kalibr"),
-        ("one.yaml", KALIBR[..KALIBR.find("cam1:").unwrap()].to_owned(), "cam1 is missing"),
-        ("apart.yaml", kalibr("T_cn_cnm1", "T_nothing"), "T_cn_cnm1 is missing"),
+        (
+            "tab.yaml",
+            kalibr("  T_cn", "\t T_cn"),
+            "not readable as Kalibr",
+        ),
+        (
+            "one.yaml",
+            KALIBR[..KALIBR.find("cam1:").unwrap()].to_owned(),
+            "cam1 is missing",
+        ),
+        (
+            "apart.yaml",
+            kalibr("T_cn_cnm1", "T_nothing"),
+            "T_cn_cnm1 is missing",
+        ),
         ("swapped.yaml", kalibr("-0.11]", "0.11]"), "swapped"),
-        ("mirrored.yaml", kalibr("[0.0, 0.0, 1.0, -0.0006]", "[0.0, 0.0, -1.0, -0.0006]"), "left-handed"),
-        ("left-handed-mount.yaml", kalibr("[0.0, 1.0, 0.0, 0.037]", "[0.0, -1.0, 0.0, 0.037]"), "left-handed"),
-        ("sheared.yaml", kalibr("[0.0, 1.0, 0.0, 0.0004]", "[0.2, 1.0, 0.0, 0.0004]"), "no rotation"),
-        ("three.yaml", kalibr("[458.6, 457.3, 367.2, 248.4]", "[458.6, 457.3, 367.2]"), "has 3 numbers, needed are 4"),
+        (
+            "mirrored.yaml",
+            kalibr("[0.0, 0.0, 1.0, -0.0006]", "[0.0, 0.0, -1.0, -0.0006]"),
+            "left-handed",
+        ),
+        (
+            "left-handed-mount.yaml",
+            kalibr("[0.0, 1.0, 0.0, 0.037]", "[0.0, -1.0, 0.0, 0.037]"),
+            "left-handed",
+        ),
+        (
+            "sheared.yaml",
+            kalibr("[0.0, 1.0, 0.0, 0.0004]", "[0.2, 1.0, 0.0, 0.0004]"),
+            "no rotation",
+        ),
+        (
+            "three.yaml",
+            kalibr("[458.6, 457.3, 367.2, 248.4]", "[458.6, 457.3, 367.2]"),
+            "has 3 numbers, needed are 4",
+        ),
         ("nan.yaml", kalibr("458.6", ".nan"), "not finite"),
-        ("omni.yaml", kalibr("camera_model: pinhole", "camera_model: omni"), "\"omni\" is unknown"),
-        ("fisheye.yaml", kalibr("radtan", "equidistant").replace("458.6, 457.3", "200.0, 200.0"), "missed by"),
-        ("cut.json", DEPTHAI[..900].to_owned(), "not readable as DepthAI"),
-        ("uncalibrated.json", depthai("[2, {", "[5, {"), "socket 2 is missing"),
-        ("island.json", depthai("\"toCameraSocket\": 2", "\"toCameraSocket\": -1").replace("\"toCameraSocket\": 0", "\"toCameraSocket\": -1"), "chain of extrinsics"),
-        ("tilted.json", depthai("0, 0, 0, 0, 0, 0, 0, 0, 0],\n      \"extrinsics\": {\"rotationMatrix\": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],\n        \"specTranslation\": {\"x\": -7.5", "0, 0, 0, 0, 0, 0, 0, 0.1, 0],\n      \"extrinsics\": {\"rotationMatrix\": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],\n        \"specTranslation\": {\"x\": -7.5"), "without tilt"),
+        (
+            "omni.yaml",
+            kalibr("camera_model: pinhole", "camera_model: omni"),
+            "\"omni\" is unknown",
+        ),
+        (
+            "fisheye.yaml",
+            kalibr("radtan", "equidistant").replace("458.6, 457.3", "200.0, 200.0"),
+            "missed by",
+        ),
+        (
+            "cut.json",
+            DEPTHAI[..900].to_owned(),
+            "not readable as DepthAI",
+        ),
+        (
+            "uncalibrated.json",
+            depthai("[2, {", "[5, {"),
+            "socket 2 is missing",
+        ),
+        (
+            "island.json",
+            depthai("\"toCameraSocket\": 2", "\"toCameraSocket\": -1")
+                .replace("\"toCameraSocket\": 0", "\"toCameraSocket\": -1"),
+            "chain of extrinsics",
+        ),
+        (
+            "tilted.json",
+            depthai(
+                "0, 0, 0, 0, 0, 0, 0, 0, 0],\n      \"extrinsics\": {\"rotationMatrix\": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],\n        \"specTranslation\": {\"x\": -7.5",
+                "0, 0, 0, 0, 0, 0, 0, 0.1, 0],\n      \"extrinsics\": {\"rotationMatrix\": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],\n        \"specTranslation\": {\"x\": -7.5",
+            ),
+            "without tilt",
+        ),
         ("cut.yml", opencv_text()[..400].to_owned(), "OpenCV"),
         ("no-t.yml", opencv("\nT:", "\nTT:"), "T is missing"),
-        ("unitless.yml", opencv("translation_unit", "other"), "--translation-unit"),
-        ("sizeless.yml", opencv("image_width", "breadth"), "--image-size"),
+        (
+            "unitless.yml",
+            opencv("translation_unit", "other"),
+            "--translation-unit",
+        ),
+        (
+            "sizeless.yml",
+            opencv("image_width", "breadth"),
+            "--image-size",
+        ),
     ]
 }
 
@@ -226,7 +321,10 @@ fn broken_files_are_refused_in_one_line_that_helps() {
             Ok(found) => panic!("{name} was accepted: {found:?}"),
             Err(error) => error.to_string(),
         };
-        println!("{}", message.replace(&folder.path().display().to_string(), ""));
+        println!(
+            "{}",
+            message.replace(&folder.path().display().to_string(), "")
+        );
         assert!(message.contains(words), "{name}: {message}");
         assert!(message.contains(name), "{message}");
         assert!(!message.contains('\n') && message.len() < 400, "{message}");
@@ -245,7 +343,11 @@ fn what_a_file_does_not_say_is_asked_for_by_name() {
         ..Answers::default()
     };
     let found = import(&[written(&folder, "mm.yml", &unitless)], millimetres).unwrap();
-    assert!((found.translation_m.norm() - 0.000_075).abs() < 1e-7, "{}", found.translation_m);
+    assert!(
+        (found.translation_m.norm() - 0.000_075).abs() < 1e-7,
+        "{}",
+        found.translation_m
+    );
 }
 
 #[test]
@@ -259,9 +361,17 @@ fn a_ros_pair_without_a_baseline_is_refused() {
     assert!(alone.to_string().contains("two files"), "{alone}");
     // Left and right exchanged while calibrating: the baseline has the other sign.
     let along = right.split("projection_matrix").nth(1).unwrap();
-    let number = along.split("data: [").nth(1).unwrap().split(", ").nth(3).unwrap();
+    let number = along
+        .split("data: [")
+        .nth(1)
+        .unwrap()
+        .split(", ")
+        .nth(3)
+        .unwrap();
     let other = number.trim_start_matches('-');
     let swapped = written(&folder, "right.yaml", &right.replace(number, other));
-    let message = import(&[left, swapped], Answers::default()).unwrap_err().to_string();
+    let message = import(&[left, swapped], Answers::default())
+        .unwrap_err()
+        .to_string();
     assert!(message.contains("swapped"), "{message}");
 }

@@ -48,6 +48,8 @@ pub enum Telemetry {
     CameraTrackingGeoStatus(CameraTrackingGeoStatus),
     /// RADIO_STATUS.
     RadioStatus(RadioStatus),
+    /// WIND_COV, where the autopilot knows the wind.
+    Wind(WindEstimate),
     /// Anything else.
     Other {
         /// Its id.
@@ -201,6 +203,15 @@ pub struct GpsRaw {
     pub course_rad: Option<f64>,
     /// Satellites in view.
     pub satellites: Option<u8>,
+}
+
+/// Where the air goes, as the autopilot's estimator has it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct WindEstimate {
+    /// East, north, up, m/s: where it blows to.
+    pub towards_enu_m_s: Vector3<f64>,
+    /// One sigma per horizontal axis, m/s; `None` where it is not stated.
+    pub horizontal_sigma_m_s: Option<f64>,
 }
 
 /// The vehicle's two clocks.
@@ -604,10 +615,23 @@ fn translate(message: &MavMessage) -> Result<Telemetry, DecodeError> {
             Telemetry::CameraTrackingGeoStatus(tracking_status(m)?)
         }
         MavMessage::RADIO_STATUS(m) => Telemetry::RadioStatus(radio_status(m)),
+        MavMessage::WIND_COV(m) if m.wind_x.is_finite() && m.wind_y.is_finite() => {
+            Telemetry::Wind(wind(m))
+        }
         other => Telemetry::Other {
             message_id: other.message_id(),
         },
     })
+}
+
+/// North and east on the wire are the air's own motion, so the wind blows towards them.
+fn wind(m: &dialect::WIND_COV_DATA) -> WindEstimate {
+    let up = if m.wind_z.is_finite() { -m.wind_z } else { 0.0 };
+    let variance = f64::from(m.var_horiz);
+    WindEstimate {
+        towards_enu_m_s: Vector3::new(f64::from(m.wind_y), f64::from(m.wind_x), f64::from(up)),
+        horizontal_sigma_m_s: (variance.is_finite() && variance > 0.0).then(|| variance.sqrt()),
+    }
 }
 
 fn heartbeat(m: &dialect::HEARTBEAT_DATA) -> Heartbeat {

@@ -6,6 +6,8 @@ use crate::mission::{CameraConfig, Mission};
 use crate::noise::{normal, stream};
 use crate::render::{RenderConfig, Renderer, StereoCamera, encode_jpeg};
 use crate::score::{Class, Truth};
+use crate::spectrometer::{self, SpectrometerConfig};
+use crate::state::BodyState;
 use crate::stream::EncodedPair;
 use crate::world::{BurningClass, FireTruth, World};
 use emberfix_calib::Eye;
@@ -20,6 +22,7 @@ pub struct Cameras {
     errors: ErrorsConfig,
     rig_offset_s: f64,
     seed: u64,
+    spectrometer: Option<SpectrometerConfig>,
 }
 
 impl Cameras {
@@ -31,7 +34,8 @@ impl Cameras {
         flight: Arc<Flight>,
         errors: &ErrorsConfig,
     ) -> Self {
-        let camera = StereoCamera::new(&mission.rig);
+        let camera = StereoCamera::new(&mission.rig)
+            .with_mount_error(mission.sim.camera.mount_error_deg.map(f64::to_radians));
         Self {
             renderer: Renderer::new(
                 world,
@@ -50,6 +54,7 @@ impl Cameras {
             },
             rig_offset_s: mission.rig.time_offset_s(),
             seed: mission.sim.seed,
+            spectrometer: mission.sim.spectrometer,
         }
     }
 
@@ -85,7 +90,14 @@ impl Cameras {
             arrives_s: self.arrives_s(index),
             left: jpeg(Eye::Left),
             right: jpeg(Eye::Right),
+            spectrum: self.spectrum(&state, taken_s),
         }
+    }
+
+    fn spectrum(&self, state: &BodyState, taken_s: f64) -> Option<Vec<u8>> {
+        let config = self.spectrometer?;
+        let world = self.renderer.world();
+        spectrometer::reading(&config, world, &state.position_m, taken_s, self.seed)
     }
 
     /// What burns in the world and was seen by the left eye in [`SEEN_PAIRS`] pairs at least.
@@ -156,6 +168,8 @@ pub struct TakenPair {
     pub left: Vec<u8>,
     /// Right image, JPEG.
     pub right: Vec<u8>,
+    /// Spectrometer reading of the same moment, JSON.
+    pub spectrum: Option<Vec<u8>>,
 }
 
 impl TakenPair {
@@ -167,6 +181,7 @@ impl TakenPair {
             arrives: start + seconds(self.arrives_s),
             left: self.left,
             right: self.right,
+            spectrum: self.spectrum,
         }
     }
 }

@@ -357,6 +357,7 @@ fn random_world(rng: &mut ChaCha8Rng) -> WorldConfig {
         spreads: Vec::new(),
         smokes: (0..smokes).map(|k| random_smoke(rng, k)).collect(),
         lookalikes: (0..lookalikes).map(|_| random_lookalike(rng)).collect(),
+        boards: Vec::new(),
         trees: TreesConfig {
             count: rng.random_range(0..250),
             seed: rng.random(),

@@ -16,6 +16,7 @@ pub mod noise;
 pub mod record;
 pub mod render;
 pub mod score;
+pub mod spectrometer;
 pub mod state;
 pub mod stream;
 pub mod world;

@@ -6,6 +6,7 @@
 use crate::autopilot::{AutopilotConfig, ErrorsConfig};
 use crate::earth::Lla;
 use crate::flight::{FlightConfig, PathConfig};
+use crate::spectrometer::SpectrometerConfig;
 use crate::world::WorldConfig;
 use emberfix_calib::{Rig, RigError};
 use emberfix_frames::ServiceTime;
@@ -91,6 +92,9 @@ pub struct SimConfig {
     /// How wrong the sensors are.
     #[serde(default)]
     pub errors: ErrorsConfig,
+    /// A spectrometer in step with the frames, if there is one.
+    #[serde(default)]
+    pub spectrometer: Option<SpectrometerConfig>,
     /// What is there.
     pub world: WorldConfig,
 }
@@ -107,6 +111,9 @@ pub struct CameraConfig {
     /// From mid-exposure to the pair's arrival, seconds.
     #[serde(default = "default_latency_s")]
     pub latency_s: f64,
+    /// How the camera truly stands, beyond what the rig file says: yaw, depression, roll.
+    #[serde(default)]
+    pub mount_error_deg: [f64; 3],
 }
 
 fn default_quality() -> u8 {
@@ -291,6 +298,10 @@ fn check_sim(checks: &mut Checks, sim: &SimConfig) {
         100.0,
     );
     checks.range("sim.camera.latency_s", sim.camera.latency_s, 0.0, 2.0);
+    for (axis, error) in sim.camera.mount_error_deg.iter().enumerate() {
+        let key = format!("sim.camera.mount_error_deg[{axis}]");
+        checks.range(&key, *error, -45.0, 45.0);
+    }
     checks.range(
         "sim.autopilot.booted_before_s",
         sim.autopilot.booted_before_s,

@@ -42,6 +42,8 @@ pub struct EncodedPair {
     pub left: Vec<u8>,
     /// Right image, JPEG.
     pub right: Vec<u8>,
+    /// Spectrometer reading of the same moment, JSON.
+    pub spectrum: Option<Vec<u8>>,
 }
 
 /// Writes the contract's input topics.
@@ -50,6 +52,8 @@ pub struct StereoWriter<W: Write + Seek> {
     images: [u16; 2],
     calibrations: [u16; 2],
     mavlink: Option<u16>,
+    /// Declared with the first reading.
+    spectrometer: Option<u16>,
     sequence: u32,
 }
 
@@ -93,6 +97,7 @@ impl<W: Write + Seek> StereoWriter<W> {
             images,
             calibrations,
             mavlink,
+            spectrometer: None,
             sequence: 0,
         })
     }
@@ -119,7 +124,12 @@ impl<W: Write + Seek> StereoWriter<W> {
             arrives,
             left,
             right,
+            spectrum,
         } = pair;
+        if let Some(spectrum) = spectrum {
+            let channel = self.spectrometer()?;
+            self.write(channel, arrives, stamped, &spectrum)?;
+        }
         for ((channel, eye), jpeg) in self.images.into_iter().zip(EYES).zip([left, right]) {
             let image = CompressedImage {
                 timestamp: Some(timestamp(stamped)),
@@ -135,6 +145,17 @@ impl<W: Write + Seek> StereoWriter<W> {
             )?;
         }
         Ok(())
+    }
+
+    fn spectrometer(&mut self) -> Result<u16, StreamError> {
+        if let Some(channel) = self.spectrometer {
+            return Ok(channel);
+        }
+        let channel = self
+            .writer
+            .add_channel(0, "/spectrometer", "json", &BTreeMap::new())?;
+        self.spectrometer = Some(channel);
+        Ok(channel)
     }
 
     /// One MAVLink frame, the bytes as they came. Dropped when the stream carries none.

@@ -1,6 +1,10 @@
 //! When a fire is told, and when told again.
 
 use super::{Advice, Alarm, AlarmProperties, FireId, FireState};
+use super::{Area, Burning, SizeM, TrendProbability};
+use crate::assess::extent::{Measured, SizeClass};
+use crate::assess::trend::Course;
+use crate::assess::watch::Assessment;
 use crate::track::Fire;
 use emberfix_frames::{
     Covariance, HeightAboveGround, MissionEnu, MslAltitude, ServiceTime, Wgs84, enu_offset,
@@ -18,6 +22,10 @@ pub struct Situation {
     pub above_ground: Option<HeightAboveGround>,
     /// Which way to fly so that its ellipse shrinks most.
     pub advice: Option<Advice>,
+    /// How it burns.
+    pub assessment: Assessment,
+    /// The burning ground, its corners on the Earth.
+    pub area: Option<Area>,
     /// Reasons why the ellipse is wider than it could be.
     pub degraded: Vec<String>,
 }
@@ -113,7 +121,7 @@ impl AlarmDesk {
         let Some(told) = self.told.get(&fire.id) else {
             return true;
         };
-        if told.state != fire.state {
+        if told.state != state(fire, &situation.assessment) {
             return true;
         }
         let since_s = (fire.last_seen - told.captured_at).as_secs_f64();
@@ -135,7 +143,7 @@ impl AlarmDesk {
             fire.id,
             Told {
                 revision,
-                state: fire.state,
+                state: state(fire, &situation.assessment),
                 place,
                 ce90_m,
                 captured_at: fire.last_seen,
@@ -148,7 +156,7 @@ impl AlarmDesk {
                 revision,
                 uav: self.uav.clone(),
                 class: fire.class,
-                state: fire.state,
+                state: state(fire, &situation.assessment),
                 confidence: fire.evidence.probability(),
                 first_seen_at: fire.first_seen,
                 captured_at: fire.last_seen,
@@ -160,11 +168,50 @@ impl AlarmDesk {
                 methods: fire.methods(),
                 sightings: fire.evidence.hits(),
                 range_m: fire.range_m,
-                size_m: fire.size_m,
-                trend: None,
+                size_m: size(&situation.assessment).map_or(fire.size_m, |(size, _)| Some(size)),
+                trend: situation.assessment.trend.map(|trend| trend.slope.value),
                 advice: situation.advice,
+                burning: burning(&situation),
                 degraded: situation.degraded,
             },
         }
+    }
+}
+
+/// What the alarm says of a fire: a confirmed one grows, is steady or dies, once that is known.
+fn state(fire: &Fire, assessment: &Assessment) -> FireState {
+    match (fire.state, assessment.course()) {
+        (FireState::Confirmed, Some(Course::Growing)) => FireState::Growing,
+        (FireState::Confirmed, Some(Course::Steady)) => FireState::Steady,
+        (FireState::Confirmed, Some(Course::Dying)) => FireState::Dying,
+        (state, _) => state,
+    }
+}
+
+/// Size and one sigma of it.
+fn size(assessment: &Assessment) -> Option<(SizeM, SizeM)> {
+    let extent = assessment.extent.as_ref()?;
+    let of = |pick: fn(&Measured) -> f64| SizeM {
+        width: pick(&extent.width_m),
+        height: pick(&extent.height_m),
+    };
+    Some((of(|side| side.value), of(|side| side.sigma)))
+}
+
+fn burning(situation: &Situation) -> Burning {
+    let assessment = &situation.assessment;
+    let size = size(assessment);
+    Burning {
+        size_sigma_m: size.map(|(_, sigma)| sigma),
+        size_class: size.map(|(size, _)| SizeClass::of(size.width, size.height)),
+        trend_sigma: assessment.trend.map(|trend| trend.slope.sigma),
+        trend_probability: assessment.trend.map(|trend| TrendProbability {
+            growing: trend.growing,
+            dying: trend.dying,
+        }),
+        intensity: assessment.intensity,
+        intensity_history: assessment.history.clone(),
+        area: situation.area.clone(),
+        spread: assessment.extent.as_ref().and_then(|extent| extent.spread),
     }
 }

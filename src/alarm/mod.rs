@@ -4,8 +4,10 @@
 //! latitude, ellipsoid height). The position is the base of the fire: where the burning thing
 //! stands, beneath the flame's centre. Pure: no I/O, no clock.
 
+mod burning;
 mod desk;
 
+pub use burning::{Area, Burning, TrendProbability};
 pub use desk::{AlarmDesk, LEAST_S, REPEAT_S, Situation};
 
 use emberfix_frames::{Covariance, EllipsoidHeight, MissionEnu, ServiceTime, Wgs84, Wgs84Parts};
@@ -130,6 +132,9 @@ pub struct AlarmProperties {
     /// Which way to fly so that the ellipse shrinks most; absent when nothing is worth it.
     #[serde(default)]
     pub advice: Option<Advice>,
+    /// How it burns.
+    #[serde(flatten)]
+    pub burning: Burning,
     /// Reasons why the ellipse is wider than it could be; empty when all is well.
     pub degraded: Vec<String>,
 }

@@ -15,9 +15,9 @@
 //!
 //! **Known limits.** One head per fire. A sharp turn of the front is averaged over [`WINDOW_S`].
 
-use super::outline::{InMetres, Look};
+use super::outline::{InMetres, Look, Reach};
 use emberfix_frames::{ServiceTime, Vector3};
-use nalgebra::{Matrix4, Vector2, Vector4};
+use nalgebra::{SMatrix, SVector, Vector2};
 use serde::{Deserialize, Serialize};
 use std::collections::VecDeque;
 
@@ -57,6 +57,8 @@ pub struct Extent {
     pub width_m: Measured,
     /// Of the flames, upwards, metres.
     pub height_m: Measured,
+    /// Level of the ground there, up in the mission plane, metres.
+    pub level_m: f64,
     /// Corners of the burning ground, east and north in the mission plane, anticlockwise.
     pub polygon_m: Vec<Vector2<f64>>,
     /// One sigma of the polygon's edge, metres, without the error of the fire's position.
@@ -99,29 +101,39 @@ pub const WINDOW_S: f64 = 40.0;
 const SPACING_S: f64 = 0.25;
 /// Looks that are kept at most.
 const MOST_LOOKS: usize = 160;
-/// Looks from which an extent is told, and from which a spread is.
+/// Looks from which an extent is told.
 const LEAST_LOOKS: usize = 6;
-const LEAST_SPREAD_LOOKS: usize = 16;
-/// Seconds that those span at least.
-const LEAST_SPREAD_S: f64 = 6.0;
-/// Seconds of looks that say how large it is now.
-const SIZE_S: f64 = 10.0;
-/// A box against the flame that it is of, wide and high, and how far that differs from fire to
-/// fire: glow widens it, sway and puffs reach beyond the mean.
-const BOX_OVER_FLAME: (f64, f64) = (1.0, 1.0);
-const BOX_SIGMA: f64 = 0.1;
-/// Depth of a fire's bed against its width, when nothing better is known.
-const BED_DEPTH: f64 = 0.6;
-/// Spread is told from this many sigmas.
-const SURE: f64 = 2.5;
-/// Prior of the rate A, m/s, and of place and size, metres: far wider than any of them.
+/// Looks, seconds and degrees of view from which an oval is fitted: from one side, the far side of a
+/// fire and the speed of its head can't be told.
+const LEAST_OVAL_LOOKS: usize = 16;
+const LEAST_OVAL_S: f64 = 8.0;
+const LEAST_OVAL_DEG: f64 = 60.0;
+/// Seconds of looks that say how wide and how high it is now.
+const WIDTH_S: f64 = 10.0;
+const HEIGHT_S: f64 = 12.0;
+/// How far a box's side differs from its flame's for as long as we look: a detector's habits, glow.
+const BOX_SIGMA: f64 = 0.06;
+/// Depth of a fire against its width when it was seen from one side only, and one sigma of that share.
+const DEPTH: f64 = 1.0;
+const DEPTH_SIGMA: f64 = 0.4;
+/// Spread is told from this many sigmas of its speed, and below this sigma of its direction.
+const SURE: f64 = 3.0;
+const SURE_DEG: f64 = 20.0;
+/// Share of the speed, and degrees, that the oval itself is wrong by: fires are no ellipses.
+const SPEED_SHARE: f64 = 0.17;
+const DIRECTION_DEG: f64 = 6.0;
+/// Share of the depth that it is wrong by for the same reason.
+const DEPTH_SHARE: f64 = 0.1;
+/// Prior of the rate A, m/s; it and the size are otherwise as likely in each octave.
 const RATE_PRIOR: f64 = 3.0;
-const PLACE_PRIOR: f64 = 50.0;
+/// Slower than this nothing is told apart from standing still, m/s.
+const STANDING_M_S: f64 = 0.05;
 
 /// The looks at one fire. Bound: [`MOST_LOOKS`]; the oldest goes first.
 #[derive(Debug, Clone, Default)]
 pub struct Outline {
     looks: VecDeque<Look>,
+    asked: Option<ServiceTime>,
 }
 
 /// The fire's near edge and what is known of its range.
@@ -131,9 +143,23 @@ pub struct Standing {
     pub foot: Vector3<f64>,
     /// One sigma of the range, as a share of it.
     pub range_share: f64,
+    /// How far the reported camera wanders against the ground, across and upwards, metres per square
+    /// root of a second: it makes a fire seem to move.
+    pub wander_m: (f64, f64),
 }
 
 impl Outline {
+    /// Whether `every_s` have passed since the last time that this was true.
+    pub fn is_due(&mut self, at: ServiceTime, every_s: f64) -> bool {
+        let due = self
+            .asked
+            .is_none_or(|last| (at - last).as_secs_f64() >= every_s);
+        if due {
+            self.asked = Some(at);
+        }
+        due
+    }
+
     /// Takes one look in.
     pub fn add(&mut self, look: Look) {
         let last = self.looks.back();
@@ -156,51 +182,105 @@ impl Outline {
     /// The extent at the latest look; `None` before there are enough.
     #[must_use]
     pub fn extent(&self, standing: &Standing, wind: Option<&Wind>) -> Option<Extent> {
-        let anchor = standing.foot.xy();
-        let now = self.looks.back()?.at;
-        let seconds = |at: ServiceTime| (at - now).as_secs_f64();
-        let looks: Vec<(f64, InMetres)> = self
-            .looks
-            .iter()
-            .filter_map(|look| Some((seconds(look.at), look.in_metres(&standing.foot, &anchor)?)))
-            .collect();
-        if looks.len() < LEAST_LOOKS {
-            return None;
+        let mut depth = Measured {
+            value: 0.0,
+            sigma: 0.0,
+        };
+        let mut looks = self.in_metres(standing, depth.value)?;
+        let width = Line::through(&recent(&looks, WIDTH_S, |look| look.width_m))?.value;
+        depth = Measured {
+            value: DEPTH * width,
+            sigma: DEPTH_SIGMA * width,
+        };
+        let mut shape = None;
+        if self.shows_an_oval(&looks) {
+            // The sides are seen at half the depth, which the oval says only afterwards.
+            for _ in 0..2 {
+                looks = self.in_metres(standing, depth.value)?;
+                let sight = looks.last()?.1.sight;
+                shape = Shape::fit(&looks, standing, wind);
+                depth = shape.as_ref().map_or(depth, |shape| shape.depth_m(&sight));
+            }
         }
-        let width_m = side(&looks, standing, |look| look.width_m / BOX_OVER_FLAME.0)?;
-        let shape = self.shape(&looks, wind);
-        let height_m = side(&looks, standing, |look| {
-            let depth = shape.as_ref().map_or(BED_DEPTH * width_m.value, |shape| {
-                shape.depth_m(&look.sight)
-            });
-            (look.apparent_height_m - depth * look.slope).max(0.3 * look.apparent_height_m)
-                / BOX_OVER_FLAME.1
-        })?;
+        looks = self.in_metres(standing, depth.value)?;
+        let width_m = width_of(&looks, standing, &depth)?;
+        let height_m = super::height::height(&recent_looks(&looks, HEIGHT_S), &depth, wind)?
+            .or_share(standing.range_share.hypot(BOX_SIGMA));
         let shape = shape.unwrap_or_else(|| Shape::disc(&looks, &width_m));
-        Some(shape.told(anchor, width_m, height_m, standing))
+        Some(shape.told(standing, width_m, height_m))
     }
 
-    fn shape(&self, looks: &[(f64, InMetres)], wind: Option<&Wind>) -> Option<Shape> {
-        let enough = looks.len() >= LEAST_SPREAD_LOOKS && self.span_s() >= LEAST_SPREAD_S;
-        enough.then(|| Shape::fit(looks, wind)).flatten()
+    fn in_metres(&self, standing: &Standing, depth_m: f64) -> Option<Vec<(f64, InMetres)>> {
+        let anchor = standing.foot.xy();
+        let last = self.looks.back()?;
+        let middle = last.middle(&standing.foot, depth_m);
+        let in_metres = |look: &Look| {
+            let metres = look.in_metres(&middle, depth_m, &anchor)?;
+            Some(((look.at - last.at).as_secs_f64(), metres))
+        };
+        let looks: Vec<(f64, InMetres)> = self.looks.iter().filter_map(in_metres).collect();
+        (looks.len() >= LEAST_LOOKS).then_some(looks)
+    }
+
+    fn shows_an_oval(&self, looks: &[(f64, InMetres)]) -> bool {
+        looks.len() >= LEAST_OVAL_LOOKS
+            && self.span_s() >= LEAST_OVAL_S
+            && view_deg(looks) >= LEAST_OVAL_DEG
     }
 }
 
-/// One side of the fire now: a line through the last seconds, and its error.
-fn side(
+/// Degrees over which the fire was looked at.
+fn view_deg(looks: &[(f64, InMetres)]) -> f64 {
+    let mean: Vector2<f64> = looks.iter().map(|(_, look)| look.sight).sum();
+    let angles = looks
+        .iter()
+        .map(|(_, look)| mean.perp(&look.sight).atan2(mean.dot(&look.sight)));
+    let (low, high) = angles.fold((0.0_f64, 0.0_f64), |(low, high), angle| {
+        (low.min(angle), high.max(angle))
+    });
+    (high - low).to_degrees()
+}
+
+fn recent_looks(looks: &[(f64, InMetres)], seconds: f64) -> Vec<(f64, InMetres)> {
+    looks
+        .iter()
+        .filter(|(t, _)| *t >= -seconds)
+        .copied()
+        .collect()
+}
+
+fn recent(
     looks: &[(f64, InMetres)],
-    standing: &Standing,
+    seconds: f64,
     of: impl Fn(&InMetres) -> f64,
-) -> Option<Measured> {
-    let recent = looks.iter().filter(|(t, _)| *t >= -SIZE_S);
-    let points: Vec<(f64, f64)> = recent.map(|(t, look)| (*t, of(look))).collect();
-    let line = Line::through(&points)?;
-    let pixel = looks.last().map_or(0.0, |(_, look)| look.range_m * 1e-3);
-    let systematic = line.value * standing.range_share.hypot(BOX_SIGMA);
+) -> Vec<(f64, f64)> {
+    let recent = looks.iter().filter(|(t, _)| *t >= -seconds);
+    recent.map(|(t, look)| (*t, of(look))).collect()
+}
+
+/// Width now: a line through the last seconds, with what the range, the box and the depth at which
+/// its sides are seen may be wrong by.
+fn width_of(looks: &[(f64, InMetres)], standing: &Standing, depth: &Measured) -> Option<Measured> {
+    let line = Line::through(&recent(looks, WIDTH_S, |look| look.width_m))?;
+    let flat_m = looks.last()?.1.flat_m;
+    let share = standing
+        .range_share
+        .hypot(BOX_SIGMA)
+        .hypot(0.5 * depth.sigma / flat_m);
     Some(Measured {
         value: line.value,
-        sigma: line.value_sigma.hypot(systematic).hypot(pixel),
+        sigma: line.value_sigma.hypot(line.value * share),
     })
+}
+
+impl Measured {
+    /// With an error that is a share of the value, beside its own.
+    fn or_share(self, share: f64) -> Self {
+        Self {
+            sigma: self.sigma.hypot(self.value * share),
+            ..self
+        }
+    }
 }
 
 /// A least-squares line: its value at time 0 and its slope, with errors that know that neighbours
@@ -256,14 +336,19 @@ fn likeness(left: &[f64]) -> f64 {
     (lagged / power).clamp(0.0, 0.95)
 }
 
+/// What is solved for at each node of the grid: place of the focus from the anchor (east, north), H
+/// now, A, wander of the reported camera (east, north, up; m/s), offset of the near edge.
+const UNKNOWNS: usize = 8;
+const H: usize = 2;
+const A: usize = 3;
+
 /// One node of the grid: head, eccentricity, and what follows for them.
 #[derive(Debug, Clone, Copy)]
 struct Node {
     head: Vector2<f64>,
     eccentricity: f64,
-    /// East and north of the focus from the anchor, H now, A.
-    solved: Vector4<f64>,
-    covariance: Matrix4<f64>,
+    solved: SVector<f64, UNKNOWNS>,
+    covariance: SMatrix<f64, UNKNOWNS, UNKNOWNS>,
     weight: f64,
 }
 
@@ -274,8 +359,17 @@ struct Shape {
     used_wind: bool,
 }
 
-const HEADS: usize = 48;
-const ECCENTRICITIES: [f64; 7] = [0.0, 0.3, 0.5, 0.65, 0.78, 0.87, 0.93];
+const HEADS: usize = 36;
+/// Eccentricities and how likely each is beforehand: long ones need strong wind.
+const ECCENTRICITIES: [(f64, f64); 7] = [
+    (0.0, 3.0),
+    (0.3, 2.5),
+    (0.5, 2.0),
+    (0.65, 1.5),
+    (0.78, 1.0),
+    (0.87, 0.6),
+    (0.93, 0.3),
+];
 
 /// Front of the oval of H = 1 in a direction.
 fn oval(head: &Vector2<f64>, eccentricity: f64, outwards: &Vector2<f64>) -> f64 {
@@ -284,42 +378,89 @@ fn oval(head: &Vector2<f64>, eccentricity: f64, outwards: &Vector2<f64>) -> f64 
 }
 
 /// One reach, ready for the grid.
+#[derive(Debug, Clone, Copy)]
 struct Row {
     t_s: f64,
-    outwards: Vector2<f64>,
-    metres: f64,
+    reach: Reach,
     weight: f64,
 }
 
+impl Row {
+    /// The reach over the unknowns.
+    fn by(&self, head: &Vector2<f64>, eccentricity: f64) -> SVector<f64, UNKNOWNS> {
+        let (out, t_s) = (self.reach.outwards, self.t_s);
+        let oval = oval(head, eccentricity, &out);
+        let near = f64::from(u8::from(self.reach.by_height != 0.0));
+        SVector::from([
+            out.x,
+            out.y,
+            oval,
+            oval * t_s,
+            out.x * t_s,
+            out.y * t_s,
+            self.reach.by_height * t_s,
+            near,
+        ])
+    }
+}
+
+/// What is known before the looks, as information.
+fn prior(looks: &[(f64, InMetres)], standing: &Standing) -> SVector<f64, UNKNOWNS> {
+    let range_m = looks.last().map_or(1.0, |(_, look)| look.range_m);
+    let span_s = looks.first().map_or(1.0, |(t_s, _)| -t_s).max(1.0);
+    // The slope of a random walk over a time, by least squares.
+    let wander = |per_root_s: f64| (per_root_s * (1.2 / span_s).sqrt()).max(1e-3);
+    let (across, up) = standing.wander_m;
+    let sigmas = [
+        range_m,
+        range_m,
+        range_m,
+        RATE_PRIOR,
+        wander(across),
+        wander(across),
+        wander(up),
+        standing.range_share * range_m + 0.3,
+    ];
+    SVector::from(sigmas.map(|sigma: f64| sigma.powi(-2)))
+}
+
 impl Shape {
-    fn fit(looks: &[(f64, InMetres)], wind: Option<&Wind>) -> Option<Self> {
+    fn fit(looks: &[(f64, InMetres)], standing: &Standing, wind: Option<&Wind>) -> Option<Self> {
+        let prior = prior(looks, standing);
         let mut rows: Vec<Row> = looks
             .iter()
             .flat_map(|(t_s, look)| look.reaches.iter().flatten().map(|reach| (*t_s, *reach)))
             .map(|(t_s, reach)| Row {
                 t_s,
-                outwards: reach.outwards,
-                metres: reach.metres,
+                reach,
                 weight: reach.sigma_m.powi(-2),
             })
             .collect();
-        let first = Self::over_grid(&rows, None)?;
+        let first = Self::over_grid(&rows, &prior, None)?;
         // The looks' own scatter about the best oval, and how alike neighbours are, say how much
         // each of them is worth.
         let worth = first.worth_of_a_look(&rows);
         for row in &mut rows {
             row.weight *= worth;
         }
-        Self::over_grid(&rows, wind)
+        Self::over_grid(&rows, &prior, wind)
     }
 
-    fn over_grid(rows: &[Row], wind: Option<&Wind>) -> Option<Self> {
+    fn over_grid(
+        rows: &[Row],
+        prior: &SVector<f64, UNKNOWNS>,
+        wind: Option<&Wind>,
+    ) -> Option<Self> {
         let mut nodes = Vec::with_capacity(HEADS * ECCENTRICITIES.len());
         for k in 0..HEADS {
             let azimuth = std::f64::consts::TAU * k as f64 / HEADS as f64;
             let head = Vector2::new(azimuth.sin(), azimuth.cos());
-            for eccentricity in ECCENTRICITIES {
-                nodes.extend(Node::solve(rows, head, eccentricity, wind));
+            for (eccentricity, likely) in ECCENTRICITIES {
+                let node = Node::solve(rows, prior, head, eccentricity);
+                nodes.extend(node.map(|mut node| {
+                    node.weight += likely.ln() + downwind(&head, eccentricity, wind);
+                    node
+                }));
             }
         }
         let best = nodes
@@ -338,21 +479,23 @@ impl Shape {
         (!nodes.is_empty()).then_some(Self { nodes, used_wind })
     }
 
-    /// A fire that is not known to run: a disc as wide as the fire, behind its near edge.
+    /// A fire that was seen from one side: a disc as wide as the fire, behind its near edge.
     fn disc(looks: &[(f64, InMetres)], width_m: &Measured) -> Self {
         let sight = looks.last().map_or(Vector2::y(), |(_, look)| look.sight);
-        let centre = sight * (0.5 * BED_DEPTH * width_m.value);
-        let sigmas = Vector4::new(
-            0.3 * width_m.value,
-            0.3 * width_m.value,
-            width_m.sigma / 2.0,
-            0.0,
-        );
+        let radius = width_m.value / 2.0;
+        let mut solved = SVector::zeros();
+        let centre = sight * (DEPTH * radius);
+        (solved[0], solved[1], solved[H]) = (centre.x, centre.y, radius);
+        let mut covariance = SMatrix::zeros();
+        let far = DEPTH_SIGMA * width_m.value / 2.0;
+        for (unknown, sigma) in [(0, far), (1, far), (H, width_m.sigma / 2.0)] {
+            covariance[(unknown, unknown)] = sigma * sigma;
+        }
         let node = Node {
             head: Vector2::y(),
             eccentricity: 0.0,
-            solved: Vector4::new(centre.x, centre.y, width_m.value / 2.0, 0.0),
-            covariance: Matrix4::from_diagonal(&sigmas.map(|s| s * s)),
+            solved,
+            covariance,
             weight: 1.0,
         };
         Self {
@@ -372,12 +515,12 @@ impl Shape {
         let best = self.best();
         let left: Vec<f64> = rows
             .iter()
-            .map(|row| (row.metres - best.front(row)) * row.weight.sqrt())
+            .map(|row| (row.reach.metres - best.front(row)) * row.weight.sqrt())
             .collect();
-        let variance = left.iter().map(|r| r * r).sum::<f64>() / (left.len() as f64 - 6.0).max(1.0);
+        let power: f64 = left.iter().map(|r| r * r).sum();
+        let variance = power / (left.len() as f64 - UNKNOWNS as f64).max(1.0);
         // Neighbours of one kind stand up to three rows apart.
         let lag = 3.min(left.len().saturating_sub(1));
-        let power: f64 = left.iter().map(|r| r * r).sum();
         let lagged: f64 = left.iter().zip(&left[lag..]).map(|(a, b)| a * b).sum();
         let alike = (lagged / power.max(1e-12)).clamp(0.0, 0.95);
         1.0 / (variance.max(0.05) * (1.0 + alike) / (1.0 - alike))
@@ -398,75 +541,73 @@ impl Shape {
     }
 
     /// From the near edge to the far one along a line of sight.
-    fn depth_m(&self, sight: &Vector2<f64>) -> f64 {
-        self.mean(|node| node.solved[2] * (node.oval(sight) + node.oval(&-sight)))
+    fn depth_m(&self, sight: &Vector2<f64>) -> Measured {
+        let across = |node: &Node| node.oval(sight) + node.oval(&-sight);
+        self.measured(
+            |node| node.solved[H] * across(node),
+            |node| 4.0 * node.covariance[(H, H)],
+        )
+        .or_share(DEPTH_SHARE)
     }
 
     fn spread(&self, standing: &Standing) -> Option<SpreadTold> {
-        let speed = self.measured(
-            |node| node.solved[3] * (1.0 + node.eccentricity),
-            |node| node.covariance[(3, 3)] * (1.0 + node.eccentricity).powi(2),
-        );
-        let speed = Measured {
-            sigma: speed.sigma.hypot(speed.value * standing.range_share),
-            ..speed
-        };
-        if speed.value < SURE * speed.sigma {
-            return None;
-        }
-        // An oval that does not point anywhere has no direction.
-        let pull = |node: &Node| node.weight * node.eccentricity;
-        let total: f64 = self.nodes.iter().map(pull).sum();
-        let mean = self
-            .nodes
-            .iter()
-            .map(|node| node.head * pull(node))
-            .sum::<Vector2<f64>>()
-            / total.max(1e-9);
-        let length = mean.norm().clamp(1e-6, 1.0);
-        let step = std::f64::consts::TAU / HEADS as f64;
-        // Circular standard deviation, and the grid's own width.
-        let sigma = (-2.0 * length.ln())
-            .max(0.0)
-            .sqrt()
-            .hypot(step / 12.0_f64.sqrt());
-        (total > 0.0).then(|| SpreadTold {
-            azimuth_deg: Measured {
-                value: mean.x.atan2(mean.y).to_degrees().rem_euclid(360.0),
-                sigma: sigma.to_degrees(),
-            },
-            speed_m_s: speed,
+        let speed_m_s = self
+            .measured(
+                |node| node.solved[A] * (1.0 + node.eccentricity),
+                |node| node.covariance[(A, A)] * (1.0 + node.eccentricity).powi(2),
+            )
+            .or_share(standing.range_share.hypot(SPEED_SHARE));
+        let azimuth_deg = self.azimuth_deg()?;
+        let sure = speed_m_s.value > SURE * speed_m_s.sigma && azimuth_deg.sigma < SURE_DEG;
+        sure.then_some(SpreadTold {
+            azimuth_deg,
+            speed_m_s,
             used_wind: self.used_wind,
         })
     }
 
-    fn told(
-        &self,
-        anchor: Vector2<f64>,
-        width_m: Measured,
-        height_m: Measured,
-        standing: &Standing,
-    ) -> Extent {
+    /// Circular mean and deviation of the head, each node by how much it points; `None` for what
+    /// points nowhere.
+    fn azimuth_deg(&self) -> Option<Measured> {
+        let total = self.mean(|node| node.eccentricity);
+        if total <= 0.0 {
+            return None;
+        }
+        let pulled = self.nodes.iter();
+        let mean: Vector2<f64> = pulled
+            .map(|node| node.head * (node.weight * node.eccentricity / total))
+            .sum();
+        let length = mean.norm().clamp(1e-6, 1.0 - 1e-9);
+        let grid_rad = std::f64::consts::TAU / HEADS as f64 / 12.0_f64.sqrt();
+        let sigma_rad = (-2.0 * length.ln()).sqrt().hypot(grid_rad);
+        Some(Measured {
+            value: mean.x.atan2(mean.y).to_degrees().rem_euclid(360.0),
+            sigma: sigma_rad.to_degrees().hypot(DIRECTION_DEG),
+        })
+    }
+
+    fn told(&self, standing: &Standing, width_m: Measured, height_m: Measured) -> Extent {
         let best = self.best();
+        let anchor = standing.foot.xy();
         let spread = self.spread(standing);
         let corner = |k: usize| best.corner(std::f64::consts::TAU * k as f64 / CORNERS as f64);
         let polygon_m: Vec<Vector2<f64>> = (0..CORNERS).map(|k| anchor + corner(k).0).collect();
         let runs = |k: &usize| corner(*k).1 >= 0.5 * (1.0 + best.eccentricity);
         let front = (0..CORNERS).filter(runs).map(|k| polygon_m[k]).collect();
-        let edge = self.measured(
-            |node| node.solved[2] * (1.0 + node.eccentricity),
-            |node| node.covariance[(2, 2)] + node.covariance[(0, 0)].max(node.covariance[(1, 1)]),
-        );
-        let edge_sigma_m = edge
+        let edge_sigma_m = self
+            .measured(
+                |node| node.solved[H] * (1.0 + node.eccentricity),
+                |node| {
+                    let place = node.covariance[(0, 0)].max(node.covariance[(1, 1)]);
+                    node.covariance[(H, H)] + place
+                },
+            )
             .sigma
             .hypot(width_m.value / 2.0 * standing.range_share.hypot(BOX_SIGMA));
-        let area = self.measured(Node::area_m2, |_| 0.0);
-        let relative = 2.0 * edge_sigma_m / (area.value.max(1e-6) / std::f64::consts::PI).sqrt();
+        let area = self.measured(Node::area_m2, Node::area_variance);
         Extent {
-            area_m2: Measured {
-                value: area.value,
-                sigma: area.sigma.hypot(area.value * relative.min(1.0)),
-            },
+            area_m2: area.or_share(2.0 * standing.range_share.hypot(BOX_SIGMA)),
+            level_m: standing.foot.z,
             polygon_m,
             edge_sigma_m,
             front: if spread.is_some() { front } else { Vec::new() },
@@ -483,32 +624,33 @@ const CORNERS: usize = 24;
 impl Node {
     fn solve(
         rows: &[Row],
+        prior: &SVector<f64, UNKNOWNS>,
         head: Vector2<f64>,
         eccentricity: f64,
-        wind: Option<&Wind>,
     ) -> Option<Self> {
-        let prior = Vector4::new(PLACE_PRIOR, PLACE_PRIOR, PLACE_PRIOR, RATE_PRIOR);
-        let mut information = Matrix4::from_diagonal(&prior.map(|sigma| sigma.powi(-2)));
-        let mut right = Vector4::zeros();
+        let mut information = SMatrix::<f64, UNKNOWNS, UNKNOWNS>::from_diagonal(prior);
+        let mut right = SVector::<f64, UNKNOWNS>::zeros();
         let mut squares = 0.0;
         for row in rows {
-            let oval = oval(&head, eccentricity, &row.outwards);
-            let by = Vector4::new(row.outwards.x, row.outwards.y, oval, oval * row.t_s);
-            information += by * by.transpose() * row.weight;
-            right += by * (row.metres * row.weight);
-            squares += row.metres * row.metres * row.weight;
+            let by = row.by(&head, eccentricity);
+            information.ger(row.weight, &by, &by, 1.0);
+            right.axpy(row.reach.metres * row.weight, &by, 1.0);
+            squares += row.reach.metres * row.reach.metres * row.weight;
         }
         let cholesky = information.cholesky()?;
         let solved = cholesky.solve(&right);
         let log_determinant: f64 = cholesky.l().diagonal().iter().map(|d| 2.0 * d.ln()).sum();
         let misfit = squares - solved.dot(&right);
-        let is_a_fire = solved[2] > 0.0;
-        is_a_fire.then(|| Self {
+        // As likely in each octave of size and speed, or a node that hardly says how large the fire
+        // is would win by saying little.
+        let octaves = (solved[H] * (1.0 + eccentricity)).ln()
+            + (solved[A] * (1.0 + eccentricity)).hypot(STANDING_M_S).ln();
+        (solved[H] > 0.0).then(|| Self {
             head,
             eccentricity,
             solved,
             covariance: cholesky.inverse(),
-            weight: -0.5 * (misfit + log_determinant) + downwind(&head, eccentricity, wind),
+            weight: -0.5 * (misfit + log_determinant) - octaves,
         })
     }
 
@@ -517,24 +659,29 @@ impl Node {
     }
 
     fn front(&self, row: &Row) -> f64 {
-        let size = self.solved[2] + self.solved[3] * row.t_s;
-        self.solved.xy().dot(&row.outwards) + size * self.oval(&row.outwards)
+        self.solved.dot(&row.by(&self.head, self.eccentricity))
     }
 
     fn area_m2(&self) -> f64 {
         let e = self.eccentricity;
-        std::f64::consts::PI * self.solved[2].powi(2) * (1.0 - e * e).sqrt()
+        std::f64::consts::PI * self.solved[H].powi(2) * (1.0 - e * e).sqrt()
+    }
+
+    fn area_variance(&self) -> f64 {
+        let by_size = 2.0 * self.area_m2() / self.solved[H];
+        by_size * by_size * self.covariance[(H, H)]
     }
 
     /// A corner of the oval from the anchor, and how fast the front runs there against A.
     fn corner(&self, angle: f64) -> (Vector2<f64>, f64) {
         let e = self.eccentricity;
         let left = Vector2::new(-self.head.y, self.head.x);
-        let (wide, size) = ((1.0 - e * e).sqrt(), self.solved[2]);
+        let (wide, size) = ((1.0 - e * e).sqrt(), self.solved[H]);
         let (x, y) = (e + angle.cos(), wide * angle.sin());
         let outwards = (self.head * (wide * angle.cos()) + left * angle.sin()).normalize();
+        let place = Vector2::new(self.solved[0], self.solved[1]);
         (
-            self.solved.xy() + (self.head * x + left * y) * size,
+            place + (self.head * x + left * y) * size,
             self.oval(&outwards),
         )
     }

@@ -223,6 +223,15 @@ impl Fusion {
         Some(fused)
     }
 
+    /// Nothing was seen for long: the level is doubtful, the rate unknown, and the channels may have
+    /// jumped meanwhile.
+    pub fn after_gap(&mut self) {
+        let sigmas = [JUMP, FIRST_RATE, ACCELERATION, FIRST_OFFSET, FIRST_OFFSET];
+        self.covariance = SMatrix::from_diagonal(&SVector::from(sigmas.map(|s: f64| s * s)));
+        self.mean[1] = 0.0;
+        self.mean[2] = 0.0;
+    }
+
     fn predict(&mut self, dt_s: f64) {
         let keep = (-dt_s / ACCELERATION_S).exp();
         let mut step = SMatrix::<f64, STATES, STATES>::identity();
@@ -351,7 +360,8 @@ mod tests {
 
     #[test]
     fn a_channel_that_dies_black_frozen_faded_or_missing_makes_no_dying_fire() {
-        let dead: [(&str, fn(usize, f64) -> Option<f64>); 5] = [
+        type Channel = fn(usize, f64) -> Option<f64>;
+        let dead: [(&str, Channel); 5] = [
             ("missing", |_, _| None),
             ("black", |_, _| Some(0.0)),
             ("nearly black", |k, value| {

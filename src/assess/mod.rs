@@ -1,12 +1,23 @@
 //! How a fire changes: size in metres, intensity, trend. Pure: no I/O, no clock.
 //!
-//! **In:** sightings and the fire's position. **Out:** [`SizeM`] in metres; whether a light flickers.
-//! **Known limits.** Intensity and trend are not assessed yet, and the alarm says so with `null`.
+//! **In:** sightings and the fire's position; the light of the flame and of its sodium and potassium
+//! lines. **Out:** [`watch::Assessment`]: width, height, burning ground with their errors, intensity
+//! and its trend, direction and speed of the front; whether a small light flickers.
+//!
+//! [`outline`] turns boxes into metres, [`extent`] outlines into an oval and its motion, [`fusion`]
+//! two channels into one intensity, [`trend`] that into growing, steady or dying; [`watch`] keeps all
+//! of it per fire. [`printed`] is P1's fusion, to measure against.
+//!
+//! **Known limits.** A spectrometer sees the whole scene: its light is used while one fire is seen.
 
 pub mod extent;
 pub mod fusion;
+pub mod height;
 pub mod outline;
 pub mod printed;
+pub mod spectrum;
+pub mod trend;
+pub mod watch;
 
 use crate::alarm::SizeM;
 use crate::locate::{Sighting, View};

@@ -32,6 +32,9 @@ pub struct Reach {
     pub metres: f64,
     /// One sigma of what differs from look to look, metres.
     pub sigma_m: f64,
+    /// How a reported camera that is a metre too high moves it, where it is the near edge's, metres;
+    /// 0 for the sides.
+    pub by_height: f64,
 }
 
 /// One look in metres.
@@ -39,7 +42,8 @@ pub struct Reach {
 pub struct InMetres {
     /// Across the line of sight.
     pub width_m: f64,
-    /// From the foot's level to the top ray, both above the near edge.
+    /// From the foot's ray to the top's, both above the near edge: the reported camera's own height,
+    /// which wanders, is not in it.
     pub apparent_height_m: f64,
     /// Tangent of the depression.
     pub slope: f64,
@@ -47,6 +51,8 @@ pub struct InMetres {
     pub sight: Vector2<f64>,
     /// Slant range, metres.
     pub range_m: f64,
+    /// Horizontal, from the camera to the near edge, metres.
+    pub flat_m: f64,
     /// To the right, to the left, and towards the camera where it looks down steeply enough.
     pub reaches: [Option<Reach>; 3],
 }
@@ -81,47 +87,72 @@ impl Look {
         }
     }
 
-    /// The look in metres, when the fire's near edge stands at `foot`; reaches count from `anchor`.
-    /// `None` when the camera is right above, or a ray misses.
+    /// The look in metres, when the middle of the burning ground is at `middle` and it is `depth_m`
+    /// deep; reaches count from `anchor`. The sides are taken at the middle, the height at the near
+    /// edge. `None` when the camera is right above, or a ray misses.
     #[must_use]
-    pub fn in_metres(&self, foot: &Vector3<f64>, anchor: &Vector2<f64>) -> Option<InMetres> {
+    pub fn in_metres(
+        &self,
+        middle: &Vector3<f64>,
+        depth_m: f64,
+        anchor: &Vector2<f64>,
+    ) -> Option<InMetres> {
+        let foot = self.near_edge(middle, depth_m)?;
         let to_foot = foot - self.camera;
         let flat_m = to_foot.xy().norm();
         if flat_m < 0.5 || -to_foot.z > 8.0 * flat_m {
             return None;
         }
         let sight = to_foot.xy() / flat_m;
-        let at_foot = |ray: &Vector3<f64>| {
+        let at = |ray: &Vector3<f64>, flat_m: f64| {
             let along = ray.xy().dot(&sight);
             (along > 0.05).then(|| self.camera + ray * (flat_m / along))
         };
-        let (left, right) = (at_foot(&self.left)?, at_foot(&self.right)?);
-        let top = at_foot(&self.top)?;
+        let middle_m = flat_m + depth_m / 2.0;
+        let (left, right) = (at(&self.left, middle_m)?, at(&self.right, middle_m)?);
+        let (low, top) = (at(&self.foot, flat_m)?, at(&self.top, flat_m)?);
         let to_right = Vector2::new(sight.y, -sight.x);
         let width_m = (right - left).xy().dot(&to_right);
         let range_m = to_foot.norm();
         let sigma_m = (range_m * self.edge_rad).hypot(FLICKER_SHARE * width_m);
-        let reach = |outwards: Vector2<f64>, point: Vector2<f64>, sigma_m| Reach {
+        let slope = -to_foot.z / flat_m;
+        let reach = |outwards: Vector2<f64>, point: Vector2<f64>, sigma_m, by_height| Reach {
             outwards,
             metres: (point - anchor).dot(&outwards),
             sigma_m,
+            by_height,
         };
-        let slope = -to_foot.z / flat_m;
         let near = (slope > LEAST_SLOPE)
             .then(|| self.on_ground(foot.z))
             .flatten();
         Some(InMetres {
             width_m,
-            apparent_height_m: top.z - foot.z,
+            apparent_height_m: top.z - low.z,
             slope,
             sight,
             range_m,
+            flat_m,
             reaches: [
-                Some(reach(to_right, right.xy(), sigma_m)),
-                Some(reach(-to_right, left.xy(), sigma_m)),
-                near.map(|near| reach(-sight, near, sigma_m / slope.min(1.0))),
+                Some(reach(to_right, right.xy(), sigma_m, 0.0)),
+                Some(reach(-to_right, left.xy(), sigma_m, 0.0)),
+                near.map(|near| reach(-sight, near, sigma_m / slope.min(1.0), -1.0 / slope)),
             ],
         })
+    }
+
+    /// The edge towards the camera.
+    fn near_edge(&self, middle: &Vector3<f64>, depth_m: f64) -> Option<Vector3<f64>> {
+        let sight = (middle - self.camera).xy().try_normalize(1e-3)?;
+        let back = sight * (depth_m / 2.0);
+        Some(middle - Vector3::new(back.x, back.y, 0.0))
+    }
+
+    /// The middle of burning ground that begins at `foot` and is `depth_m` deep, as seen from here.
+    #[must_use]
+    pub fn middle(&self, foot: &Vector3<f64>, depth_m: f64) -> Vector3<f64> {
+        let sight = (foot - self.camera).xy().try_normalize(1e-3);
+        let behind = sight.unwrap_or_default() * (depth_m / 2.0);
+        foot + Vector3::new(behind.x, behind.y, 0.0)
     }
 
     /// Where the lower edge's ray meets the level of the foot.
@@ -164,7 +195,7 @@ mod tests {
     #[test]
     fn a_box_is_as_many_metres_wide_and_high_as_the_range_makes_it() {
         let (look, foot) = look();
-        let metres = look.in_metres(&foot, &foot.xy()).unwrap();
+        let metres = look.in_metres(&foot, 0.0, &foot.xy()).unwrap();
         assert!((metres.width_m - 4.0).abs() < 1e-6, "{metres:?}");
         assert!((metres.apparent_height_m - 3.0).abs() < 1e-6);
         let [right, left, near] = metres.reaches.map(Option::unwrap);
@@ -174,13 +205,13 @@ mod tests {
         // Twice as far, twice as large.
         let camera = foot - Vector3::new(0.0, 20.0, -10.0);
         let far = camera + (foot - camera) * 2.0;
-        assert!((look.in_metres(&far, &far.xy()).unwrap().width_m - 8.0).abs() < 1e-6);
+        assert!((look.in_metres(&far, 0.0, &far.xy()).unwrap().width_m - 8.0).abs() < 1e-6);
     }
 
     #[test]
     fn from_right_above_there_is_no_size() {
         let (look, foot) = look();
         let beneath = Vector3::new(foot.x, foot.y - 20.0 + 0.1, foot.z);
-        assert_eq!(look.in_metres(&beneath, &beneath.xy()), None);
+        assert_eq!(look.in_metres(&beneath, 0.0, &beneath.xy()), None);
     }
 }

@@ -81,7 +81,7 @@ pub fn main() -> ExitCode {
     tracing_subscriber::fmt()
         .with_env_filter(
             tracing_subscriber::EnvFilter::try_from_env("EMBERFIX_LOG")
-                .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info,ort=warn")),
+                .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new(usual_log(&arguments))),
         )
         .with_ansi(std::io::stderr().is_terminal())
         .with_writer(std::io::stderr)
@@ -104,6 +104,14 @@ pub fn main() -> ExitCode {
             eprintln!("emberfix: {}", in_one_line(&error));
             ExitCode::FAILURE
         }
+    }
+}
+
+/// What is logged when nobody says: the doctor tells what is wrong in its own words.
+fn usual_log(arguments: &Arguments) -> &'static str {
+    match arguments.command {
+        Command::Doctor(_) => "off",
+        _ => "info,ort=warn",
     }
 }
 

@@ -7,6 +7,7 @@
 use super::{AlarmLink, LinkError, Receipt};
 use crate::alarm::Alarm;
 use crate::ground::Ping;
+use emberfix_frames::ServiceTime;
 use serde::Deserialize;
 use std::time::Duration;
 use ureq::http::{Response, StatusCode};
@@ -80,6 +81,22 @@ struct Stored {
     stored: bool,
 }
 
+/// What a ground station says of itself.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct StationHealth {
+    /// Version of its program.
+    pub version: String,
+    /// UTC by its clock, if it says one.
+    pub now: Option<ServiceTime>,
+}
+
+#[derive(Deserialize)]
+struct RawHealth {
+    status: String,
+    version: String,
+    now: String,
+}
+
 #[derive(Deserialize)]
 struct Refusal {
     error: String,
@@ -140,14 +157,7 @@ impl HttpLink {
             &alarm.to_geojson().to_string(),
         )?;
         let status = check_status(&url, &mut answer)?;
-        let text = answer
-            .body_mut()
-            .with_config()
-            .limit(MAX_ANSWER)
-            .read_to_vec();
-        let stored = text
-            .ok()
-            .and_then(|text| serde_json::from_slice::<Stored>(&text).ok());
+        let stored = read_json::<Stored>(&mut answer);
         let sent = &alarm.properties;
         match stored {
             Some(Stored {
@@ -171,6 +181,50 @@ impl HttpLink {
         let json = serde_json::json!(ping).to_string();
         let mut answer = self.post(&url, "application/json", &json)?;
         check_status(&url, &mut answer).map(|_| ())
+    }
+
+    /// What the ground says of itself.
+    ///
+    /// # Errors
+    /// [`HttpError`].
+    pub fn health(&self) -> Result<StationHealth, HttpError> {
+        let url = format!("{}/health", self.base_url);
+        let asked = self.agent.get(&url).call();
+        let mut answer = asked.map_err(|source| HttpError::Unreachable {
+            url: url.clone(),
+            source: Box::new(source),
+        })?;
+        let status = check_status(&url, &mut answer)?;
+        read_json::<RawHealth>(&mut answer)
+            .filter(|health| health.status == "ok")
+            .map(|health| StationHealth {
+                version: health.version,
+                now: ServiceTime::from_rfc3339(&health.now),
+            })
+            .ok_or(HttpError::NoReceipt {
+                url,
+                status: status.as_u16(),
+            })
+    }
+
+    /// Sends an alarm to where the ground checks and shows test alarms, and keeps none.
+    ///
+    /// # Errors
+    /// [`HttpError`]; a ground station that knows no test alarms answers 404.
+    pub fn send_test(&self, alarm: &Alarm) -> Result<(), HttpError> {
+        let url = format!("{}/alarms/test", self.base_url);
+        let json = alarm.to_geojson().to_string();
+        let mut answer = self.post(&url, "application/geo+json", &json)?;
+        let status = check_status(&url, &mut answer)?;
+        match read_json::<Stored>(&mut answer) {
+            Some(Stored {
+                id, stored: false, ..
+            }) if id == alarm.properties.id => Ok(()),
+            _ => Err(HttpError::NoReceipt {
+                url,
+                status: status.as_u16(),
+            }),
+        }
     }
 
     fn post(&self, url: &str, kind: &str, json: &str) -> Result<Response<Body>, HttpError> {
@@ -207,20 +261,24 @@ impl AlarmLink for HttpLink {
     }
 }
 
-fn check_status(url: &str, answer: &mut Response<Body>) -> Result<StatusCode, HttpError> {
-    let status = answer.status();
-    if status.is_success() {
-        return Ok(status);
-    }
+fn read_json<T: serde::de::DeserializeOwned>(answer: &mut Response<Body>) -> Option<T> {
     let text = answer
         .body_mut()
         .with_config()
         .limit(MAX_ANSWER)
         .read_to_vec()
-        .unwrap_or_default();
-    let reason = match serde_json::from_slice::<Refusal>(&text) {
-        Ok(refusal) => refusal.error,
-        Err(_) => "no reason given".to_owned(),
+        .ok()?;
+    serde_json::from_slice(&text).ok()
+}
+
+fn check_status(url: &str, answer: &mut Response<Body>) -> Result<StatusCode, HttpError> {
+    let status = answer.status();
+    if status.is_success() {
+        return Ok(status);
+    }
+    let reason = match read_json::<Refusal>(answer) {
+        Some(refusal) => refusal.error,
+        None => "no reason given".to_owned(),
     };
     Err(HttpError::Refused {
         url: url.to_owned(),

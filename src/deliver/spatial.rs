@@ -253,6 +253,7 @@ impl SpatialAlarm {
                 size_m: None,
                 trend: None,
                 advice: None,
+                burning: Default::default(),
                 degraded: vec![DEGRADED_SUMMARY.to_owned()],
             },
         })

@@ -30,6 +30,7 @@ pub(super) fn alarm(number: u32, revision: u32) -> Alarm {
             size_m: None,
             trend: None,
             advice: None,
+            burning: Default::default(),
             degraded: Vec::new(),
         },
     }

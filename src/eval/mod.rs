@@ -6,6 +6,8 @@
 //! measured is the code that flies, through its public interface. This is the only room that sees the
 //! simulator; nothing that flies depends on this room.
 
+pub mod boresight;
+pub mod calibration;
 pub mod location;
 pub mod range;
 pub mod trend;
@@ -41,6 +43,18 @@ pub struct Table {
 }
 
 impl Report {
+    /// Takes another measurement's report in behind this one; its details under a name of their own.
+    #[must_use]
+    pub fn with(mut self, name: &str, other: Self) -> Self {
+        self.figures.extend(other.figures);
+        self.tables.extend(other.tables);
+        self.plots.extend(other.plots);
+        if let Some(details) = self.details.as_object_mut() {
+            details.insert(name.to_owned(), other.details);
+        }
+        self
+    }
+
     /// Whether every figure keeps its bound.
     #[must_use]
     pub fn holds(&self) -> bool {

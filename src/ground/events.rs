@@ -6,6 +6,7 @@
 //! | `alarm` | the alarm's GeoJSON Feature | row of the store |
 //! | `track` | an aircraft's [`super::Ping`] | |
 //! | `refused` | time, link and reason of an alarm that was not taken | |
+//! | `test` | time, link and aircraft of a test alarm, which is kept nowhere | |
 //! | `time` | the ground's clock, every [`PULSE`]: a client that misses it has lost the line | |
 //!
 //! A stream without `Last-Event-ID` begins with every incident as it stands now; with it, it tells

@@ -55,6 +55,7 @@ pub(super) fn router(station: Arc<Station>, host_names: Arc<[String]>) -> Router
             get(|| page("text/css; charset=utf-8", include_str!("page/style.css"))),
         )
         .route("/alarms", post(post_alarm))
+        .route("/alarms/test", post(post_test))
         .route("/alarms.geojson", get(alarms))
         .route("/track", post(post_track))
         .route("/track.geojson", get(tracks))
@@ -209,6 +210,27 @@ async fn post_alarm(
     let properties = alarm.properties;
     let receipt = json!({ "id": properties.id, "revision": properties.revision, "stored": true });
     (status, axum::Json(receipt)).into_response()
+}
+
+/// An alarm that is only a test: checked as a real one and shown as a test, kept nowhere.
+async fn post_test(
+    State(station): Shared,
+    headers: HeaderMap,
+    body: Result<Bytes, BytesRejection>,
+) -> Response {
+    let body = match json_body(&headers, body) {
+        Ok(body) => body,
+        Err(error) => return error.answer(),
+    };
+    match station.test(&body, LINK_NAME) {
+        Ok(alarm) => {
+            let properties = alarm.properties;
+            let receipt =
+                json!({ "id": properties.id, "revision": properties.revision, "stored": false });
+            axum::Json(receipt).into_response()
+        }
+        Err(error) => not_taken(&error),
+    }
 }
 
 fn not_taken(error: &ReceiveError) -> Response {

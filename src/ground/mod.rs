@@ -3,8 +3,8 @@
 //! **Purpose.** `emberfix ground CONFIG` takes alarms from aircraft over HTTP and over MAVLink, keeps
 //! each one on disk before it acknowledges it, and shows what it has to people and programs.
 //!
-//! **In.** `POST /alarms`: one GeoJSON Feature ([`crate::alarm`]). `POST /track`: where an aircraft
-//! is ([`Ping`]). MAVLink: `COMMAND_INT` `MAV_CMD_SPATIAL_USER_1` (an alarm's summary) and
+//! **In.** `POST /alarms`: one GeoJSON Feature ([`crate::alarm`]). `POST /alarms/test`: likewise, checked
+//! and shown as a test, and kept nowhere. `POST /track`: where an aircraft is ([`Ping`]). MAVLink: `COMMAND_INT` `MAV_CMD_SPATIAL_USER_1` (an alarm's summary) and
 //! `GLOBAL_POSITION_INT`.
 //!
 //! **Out.** `GET /alarms.geojson` (FeatureCollection: the newest revision of every incident),
@@ -313,6 +313,19 @@ impl Station {
             });
         }
         Ok((alarm, kept))
+    }
+
+    /// Checks a test alarm as if it were one, and shows that a test came. Nothing is kept.
+    fn test(&self, raw: &[u8], link: &'static str) -> Result<Alarm, ReceiveError> {
+        let alarm = Alarm::from_geojson(raw)?;
+        alarm.covariance()?;
+        let uav: String = alarm.properties.uav.chars().take(MAX_REASON).collect();
+        let data = serde_json::json!({ "at": now().rfc3339(), "link": link, "uav": uav });
+        self.tell(Notice {
+            kind: "test",
+            data: data.to_string().into(),
+        });
+        Ok(alarm)
     }
 
     /// Runs work on the store where it may block.

@@ -480,3 +480,27 @@ async fn a_refused_alarm_is_news_on_the_stream() {
     );
     ground.stop().await.unwrap();
 }
+
+#[tokio::test]
+async fn a_test_alarm_is_checked_and_shown_and_kept_nowhere() {
+    let folder = tempfile::tempdir().unwrap();
+    let ground = start(folder.path()).await;
+    let address = ground.address();
+    let mut events = Events::open(address, None).await;
+    let link = HttpLink::new(&format!("http://{address}")).unwrap();
+    let sent = tokio::task::spawn_blocking(move || {
+        let health = link.health().unwrap();
+        (link.send_test(&alarm("uav-1-test", 1)), health)
+    });
+    let (sent, health) = sent.await.unwrap();
+    sent.unwrap();
+    assert_eq!(health.version, env!("CARGO_PKG_VERSION"));
+    assert!(health.now.is_some());
+    let (_, told) = events.next("test").await;
+    assert_eq!(told["link"], "http");
+    let (_, alarms) = get(address, "/alarms.geojson").await;
+    assert!(!alarms.contains("uav-1-test"), "{alarms}");
+    let (status, _) = post(address, "/alarms/test", "{\"type\":\"Feature\"}").await;
+    assert_eq!(status, 400);
+    ground.stop().await.unwrap();
+}

@@ -31,6 +31,7 @@ pub(crate) struct ChannelInfo {
 pub(crate) struct RawMessage {
     pub channel: Arc<ChannelInfo>,
     pub log_time_ns: u64,
+    pub publish_time_ns: u64,
     pub data: Bytes,
 }
 
@@ -97,6 +98,7 @@ impl Dictionary {
                 Some(RawMessage {
                     channel: Arc::clone(channel),
                     log_time_ns: header.log_time,
+                    publish_time_ns: header.publish_time,
                     data: Bytes::copy_from_slice(&data),
                 })
             }

@@ -325,6 +325,7 @@ impl Grabber {
         let is_file = matches!(self.address.device, CaptureDevice::File { .. });
         let arrived = arrived.filter(|_| !is_file).unwrap_or(at);
         let value = StereoPair {
+            spectra: Vec::new(),
             sequence,
             arrived,
             left,

@@ -102,6 +102,7 @@ impl StereoSource for Folder {
         };
         let right_at = right.as_ref().map_or(planned.at, |right| right.at);
         let pair = StereoPair {
+            spectra: Vec::new(),
             sequence: self.counters.delivered,
             arrived: planned.at.max(right_at),
             skew: right_at - planned.at,

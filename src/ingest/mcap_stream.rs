@@ -2,7 +2,8 @@
 
 use super::blocks::{BlockReader, RawMessage};
 use super::messages::{self, Refusal, Role, StatedCalibration};
-use super::{PairAssembler, StereoPair, StreamCounters, note};
+use super::{PairAssembler, SPECTRA, StereoPair, StreamCounters, note};
+use crate::assess::spectrum::Spectrum;
 use bytes::Bytes;
 use emberfix_calib::Eye;
 use emberfix_frames::{ServiceTime, Stamped};
@@ -34,6 +35,7 @@ pub enum StreamEvent {
 /// Turns messages into events; the part that live streams and recordings share.
 pub(crate) struct MessageReader {
     pub assembler: PairAssembler,
+    spectra: VecDeque<Spectrum>,
     pub counters: StreamCounters,
 }
 
@@ -41,6 +43,7 @@ impl MessageReader {
     pub fn new(assembler: PairAssembler) -> Self {
         Self {
             assembler,
+            spectra: VecDeque::new(),
             counters: StreamCounters::default(),
         }
     }
@@ -65,7 +68,8 @@ impl MessageReader {
     }
 
     fn drain(&mut self, events: &mut VecDeque<StreamEvent>) {
-        while let Some(pair) = self.assembler.pop() {
+        while let Some(mut pair) = self.assembler.pop() {
+            pair.value.spectra = self.spectra.drain(..).collect();
             events.push_back(StreamEvent::Pair(pair));
         }
     }
@@ -99,7 +103,15 @@ impl MessageReader {
                 });
             }
             Role::Mavlink => return Err(Refusal::Unreadable),
-            Role::Spectrometer => self.counters.spectrometer += 1,
+            Role::Spectrometer => {
+                let spectrum = messages::spectrum(message)?;
+                self.counters.spectrometer += 1;
+                self.spectra.push_back(spectrum);
+                if self.spectra.len() > SPECTRA {
+                    self.spectra.pop_front();
+                    self.counters.spectra_shed += 1;
+                }
+            }
             Role::Other => self.counters.other += 1,
         }
         Ok(())

@@ -2,6 +2,7 @@
 
 use super::blocks::RawMessage;
 use super::{EncodedImage, ImageEncoding};
+use crate::assess::spectrum::Spectrum;
 use bytes::Bytes;
 use emberfix_calib::{Camera, Eye};
 use emberfix_frames::ServiceTime;
@@ -23,8 +24,8 @@ pub(crate) mod topic {
 pub(crate) enum Role {
     Calibration(EyeRank),
     Mavlink,
-    Image(EyeRank),
     Spectrometer,
+    Image(EyeRank),
     Other,
 }
 
@@ -198,6 +199,27 @@ pub(crate) fn camera_matrix(camera: &Camera) -> [f64; 9] {
 fn close(stated: &[f64], rig: &[f64], limit: f64) -> bool {
     let term = |terms: &[f64], i: usize| terms.get(i).copied().unwrap_or(0.0);
     (0..stated.len().max(rig.len())).all(|i| (term(stated, i) - term(rig, i)).abs() <= limit)
+}
+
+#[derive(serde::Deserialize)]
+struct Reading {
+    wavelengths_nm: Vec<f64>,
+    intensity: Vec<f64>,
+}
+
+/// Reads a spectrometer's JSON; its publish time is mid-integration.
+pub(crate) fn spectrum(message: &RawMessage) -> Result<Spectrum, Refusal> {
+    if message.channel.message_encoding != "json" {
+        return Err(Refusal::Unreadable);
+    }
+    let reading: Reading =
+        serde_json::from_slice(&message.data).map_err(|_| Refusal::Unreadable)?;
+    let at = i64::try_from(message.publish_time_ns)
+        .ok()
+        .filter(|ns| *ns > 0)
+        .map(ServiceTime::from_unix_ns)
+        .ok_or(Refusal::Unstamped)?;
+    Spectrum::new(at, reading.wavelengths_nm, reading.intensity).map_err(|_| Refusal::Unreadable)
 }
 
 /// Reads a calibration.

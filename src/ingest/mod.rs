@@ -43,6 +43,7 @@ pub use pairing::PairAssembler;
 pub use recording::{Recorded, Recording};
 pub use url::{CameraUrl, CameraUrlError, ServiceClock, open};
 
+use crate::assess::spectrum::Spectrum;
 use bytes::Bytes;
 use emberfix_frames::{ServiceTime, SignedDuration, Stamped};
 use std::path::PathBuf;
@@ -91,7 +92,12 @@ pub struct StereoPair {
     pub right: Option<EncodedImage>,
     /// Right minus left exposure.
     pub skew: SignedDuration,
+    /// Spectrometer readings that came since the pair before, in their order; at most [`SPECTRA`].
+    pub spectra: Vec<Spectrum>,
 }
+
+/// Spectrometer readings that wait for a pair at most; the oldest goes first.
+pub const SPECTRA: usize = 16;
 
 /// A source of pairs.
 pub trait StereoSource: Send {
@@ -153,8 +159,10 @@ pub struct StreamCounters {
     pub calibrations: u64,
     /// MAVLink frames.
     pub mavlink: u64,
-    /// Spectrometer readings: not used yet.
+    /// Spectrometer readings.
     pub spectrometer: u64,
+    /// Spectrometer readings that newer ones pushed out before a pair came: dropped.
+    pub spectra_shed: u64,
     /// Messages of other topics: ignored.
     pub other: u64,
     /// Messages of channels that nothing declared: dropped.

@@ -189,6 +189,7 @@ impl PairAssembler {
         }
         let skew = right.as_ref().map(|right| right.image.at - left.image.at);
         let pair = StereoPair {
+            spectra: Vec::new(),
             sequence: self.sequence,
             arrived,
             skew: skew.unwrap_or(SignedDuration::ZERO),

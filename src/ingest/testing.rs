@@ -62,6 +62,7 @@ pub fn pair(n: i64) -> Stamped<StereoPair> {
     let exposed = at(100 * n);
     let right = jpeg(2 * n as u64 + 1, exposed + SignedDuration::from_micros(300));
     let value = StereoPair {
+        spectra: Vec::new(),
         sequence: n as u64,
         arrived: at(100 * n + 20),
         left: jpeg(2 * n as u64, exposed),

@@ -148,3 +148,61 @@ impl RawTerrain {
 fn datum_named(name: &str) -> Option<VerticalDatum> {
     DATUMS.into_iter().find(|datum| datum.name() == name)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn problems(text: &str) -> Vec<String> {
+        let raw: RawTerrain = toml::from_str(text).unwrap();
+        let mut checks = Checks::new();
+        raw.check(&mut checks);
+        checks.into_problems()
+    }
+
+    #[test]
+    fn a_plane_needs_a_height_and_tiles_need_paths() {
+        let plane = "kind = \"plane\"\nsigma_m = 1.0\n";
+        assert_eq!(
+            problems(&format!("{plane}height_ellipsoid_m = 5.0")),
+            [""; 0]
+        );
+        assert!(problems(plane)[0].contains("terrain.height_ellipsoid_m is missing"));
+        let mixed = problems(&format!("{plane}height_ellipsoid_m = 5.0\ncanopy_m = 3.0"));
+        assert_eq!(
+            mixed,
+            ["terrain.canopy_m is for kind \"tiles\", not for a plane"]
+        );
+        let tiles = "kind = \"tiles\"\nsigma_m = 4.0\n";
+        assert_eq!(problems(&format!("{tiles}paths = [\"a.tif\"]")), [""; 0]);
+        assert!(problems(tiles)[0].contains("terrain.paths is missing"));
+    }
+
+    #[test]
+    fn every_problem_of_the_table_is_told() {
+        let found = problems(
+            "kind = \"tiles\"\nsigma_m = nan\npaths = [\"a\"]\nvertical_datum = \"msl\"\n\
+             canopy_m = -1.0\nreach_m = 10.0\nheight_ellipsoid_m = 3.0",
+        );
+        assert_eq!(found.len(), 5, "{found:?}");
+        assert!(problems("kind = \"hills\"\nsigma_m = 1.0")[0].contains("allowed are"));
+    }
+
+    #[test]
+    fn tiles_that_are_refused_refuse_the_mission_each_in_a_sentence() {
+        let raw: RawTerrain = toml::from_str(
+            "kind = \"tiles\"\nsigma_m = 4.0\npaths = [\"nowhere.tif\", \"refused_utm.tif\"]\n\
+             vertical_datum = \"egm96\"",
+        )
+        .unwrap();
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/terrain");
+        let built = raw.build(&crate::testing::datum(), &|path| folder.join(path));
+        let problems = built.map(|_| ()).unwrap_err();
+        assert_eq!(problems.len(), 2, "{problems:?}");
+        assert!(
+            problems
+                .iter()
+                .all(|p| p.starts_with("terrain: ") && !p.contains('\n'))
+        );
+    }
+}

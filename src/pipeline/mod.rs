@@ -11,12 +11,15 @@
 
 mod counters;
 mod feature;
+mod light;
 mod vision;
 
 pub use counters::Counters;
 pub use vision::{Seen, Vision};
 
-use crate::alarm::{Alarm, AlarmDesk, FireId, Situation};
+use crate::alarm::{Alarm, AlarmDesk, Area, FireId, Situation};
+use crate::assess::extent::{Extent, Wind};
+use crate::assess::watch::{Assessment, Assessor, Light};
 use crate::detect::{Detection, Detector};
 use crate::ingest::StereoPair;
 use crate::locate::{Ground, SharedPriors, Terrain, View, fix};
@@ -26,12 +29,11 @@ use crate::range::Ranger;
 use crate::track::{Classified, Fire, Outcome, Tracker};
 use emberfix_calib::Rig;
 use emberfix_frames::{
-    GeoidUndulation, ServiceTime, SignedDuration, Stamped, TimeSyncSample, Wgs84, Wgs84Parts,
-    ecef_from_enu, place_from_ecef, seconds,
+    Coordinate, GeoidUndulation, Metres, MissionEnu, ServiceTime, SignedDuration, Stamped,
+    TimeSyncSample, Vector3, Wgs84, Wgs84Parts, ecef_from_enu, place_from_ecef, seconds,
 };
-use emberfix_mav::telemetry::{GpsRaw, TimeSyncMessage};
+use emberfix_mav::telemetry::{GpsRaw, TimeSyncMessage, WindEstimate};
 use emberfix_mav::{Address, Received, SystemId, Telemetry};
-use std::cell::RefCell;
 use std::sync::Arc;
 
 /// One thing that reached the service.
@@ -82,6 +84,8 @@ pub struct Pipeline {
     vision: Vision,
     poses: PoseEstimator,
     tracker: Tracker,
+    assessor: Assessor,
+    wind: Option<Stamped<Wind>>,
     desk: AlarmDesk,
     autopilot: AutopilotLock,
     waiting: Option<Box<Stamped<StereoPair>>>,
@@ -102,6 +106,10 @@ struct AutopilotLock {
     system: Option<SystemId>,
 }
 
+/// One sigma of a stated wind whose error is not stated, m/s.
+const WIND_SIGMA_M_S: f64 = 1.0;
+/// A stated wind older than this is not used.
+const WIND_AGE: SignedDuration = SignedDuration::from_secs(30);
 /// A pair or a position older than this makes the pipeline unhealthy.
 const SILENCE: SignedDuration = SignedDuration::from_secs(3);
 
@@ -123,6 +131,8 @@ impl Pipeline {
             vision: Vision::new(&mission.rig, detector, ranger),
             poses: PoseEstimator::new(mission.pose),
             tracker: Tracker::new(mission.track, first_fire),
+            assessor: Assessor::default(),
+            wind: None,
             desk: AlarmDesk::new(mission.uav.clone()),
             autopilot: AutopilotLock { system },
             waiting: None,
@@ -250,6 +260,7 @@ impl Pipeline {
                     .add_vertical_validity(status.flags.vertical_position());
                 self.counters.add("telemetry", "estimator_status");
             }
+            Telemetry::Wind(wind) => self.take_wind(wind),
             Telemetry::SystemTime(time) if time.utc_is_absurd() => {
                 self.counters.add("mavlink_refused", "absurd_utc");
             }
@@ -378,6 +389,7 @@ impl Pipeline {
             .map(|(_, sighting)| *sighting)
             .collect();
         let outcomes = self.track(&view, &sightings);
+        self.assess(pair, &seen, &outcomes, &view);
         let mut outputs = vec![Output::Pose(Box::new(pose.clone()))];
         for outcome in &outcomes {
             outputs.push(self.fix_output(&seen, outcome, &view));
@@ -392,14 +404,80 @@ impl Pipeline {
 
     /// The tracker may ask where the vehicle was at other moments: the clock error is one of its states.
     fn track(&mut self, view: &View<'_>, sightings: &[Classified]) -> Vec<Outcome> {
-        let (now, poses) = (self.now, RefCell::new(&mut self.poses));
-        let motion =
-            |later_s: f64| match poses.borrow_mut().at(view.pose.at + seconds(later_s), now) {
-                PoseAnswer::Fresh(pose) => Some(*pose),
-                _ => None,
-            };
+        let (now, poses) = (self.now, &self.poses);
+        let motion = |later_s: f64| match poses.at(view.pose.at + seconds(later_s), now) {
+            PoseAnswer::Fresh(pose) => Some(*pose),
+            _ => None,
+        };
         let view = view.clone().with_motion(&motion);
         self.tracker.step(&view, sightings, self.terrain.as_deref())
+    }
+
+    fn take_wind(&mut self, wind: &WindEstimate) {
+        self.counters.add("telemetry", "wind");
+        self.wind = Some(Stamped {
+            at: self.now,
+            value: Wind {
+                towards_m_s: wind.towards_enu_m_s.xy(),
+                sigma_m_s: wind.horizontal_sigma_m_s.unwrap_or(WIND_SIGMA_M_S),
+            },
+        });
+    }
+
+    /// What the frame says of how each fire burns.
+    fn assess(
+        &mut self,
+        pair: &Stamped<StereoPair>,
+        seen: &Seen,
+        outcomes: &[Outcome],
+        view: &View<'_>,
+    ) {
+        let spectral = self.spectral(pair, outcomes);
+        let fresh = self
+            .wind
+            .as_ref()
+            .filter(|wind| self.now - wind.at < WIND_AGE);
+        let wind = fresh.map(|wind| wind.value);
+        let fires = self.tracker.fires();
+        for outcome in outcomes {
+            let Some(fire) = fires.iter().find(|fire| Some(fire.id) == outcome.fire) else {
+                continue;
+            };
+            let light = Light {
+                visible: seen.flames.get(outcome.index).copied().flatten(),
+                spectral,
+            };
+            let sighting = &seen.sightings[outcome.index].1.sighting;
+            self.assessor
+                .note(fire, sighting, view, light, wind.as_ref());
+        }
+        self.assessor
+            .keep(|id| fires.iter().any(|fire| fire.id == id));
+    }
+
+    /// Mean light of the lines since the pair before. The instrument sees the whole scene, so it
+    /// speaks of a fire only when one alone is seen.
+    fn spectral(&mut self, pair: &Stamped<StereoPair>, outcomes: &[Outcome]) -> Option<f64> {
+        let mut lights = Vec::new();
+        for spectrum in &pair.value.spectra {
+            let light = spectrum.line_light();
+            let name = if light.is_some() {
+                "read"
+            } else {
+                "no_line_or_full"
+            };
+            self.counters.add("spectrometer", name);
+            lights.extend(light);
+        }
+        let seen = outcomes
+            .iter()
+            .filter(|outcome| outcome.fire.is_some())
+            .count();
+        if seen != 1 && !lights.is_empty() {
+            self.counters.add("spectrometer", "not_one_fire_alone");
+        }
+        let usable = seen == 1 && !lights.is_empty();
+        usable.then(|| lights.iter().sum::<f64>() / lights.len() as f64)
     }
 
     fn fix_output(&mut self, seen: &Seen, outcome: &Outcome, view: &View<'_>) -> Output {
@@ -424,6 +502,7 @@ impl Pipeline {
     fn alarms(&mut self, view: &View<'_>) -> Vec<Output> {
         let (datum, terrain) = (self.datum, self.terrain.clone());
         let (poses, degraded, tracker) = (&self.poses, &self.degraded, &self.tracker);
+        let assessor = &self.assessor;
         let due = self.desk.due(tracker.fires(), |fire| {
             let place = place_from_ecef(&ecef_from_enu(&datum).transform(fire.position()))?;
             let mut situation = situate(&place, poses, terrain.as_deref());
@@ -434,6 +513,15 @@ impl Pipeline {
                 fire.merged_into
                     .map(|into| format!("merged_into_{}", into.0)),
             );
+            if let Some(assessment) = assessor.of(fire.id) {
+                let channels = assessment.reasons.iter().map(|reason| (*reason).to_owned());
+                situation.degraded.extend(channels);
+                situation.area = assessment
+                    .extent
+                    .as_ref()
+                    .and_then(|extent| area(extent, &datum));
+                situation.assessment = assessment.clone();
+            }
             Some(situation)
         });
         due.into_iter()
@@ -468,6 +556,28 @@ fn situate(place: &Wgs84, poses: &PoseEstimator, terrain: Option<&dyn Terrain>) 
         advice: None,
         altitude: place.height() - poses.undulation(place),
         above_ground: ground.map(|ground| place.height() - ground),
+        assessment: Assessment::default(),
+        area: None,
         degraded: degraded.into_iter().map(str::to_owned).collect(),
     }
+}
+
+/// The burning ground on the Earth.
+fn area(extent: &Extent, datum: &Wgs84) -> Option<Area> {
+    let ecef_from_mission = ecef_from_enu::<MissionEnu>(datum);
+    let on_earth = |corner: &nalgebra::Vector2<f64>| -> Option<[f64; 2]> {
+        let point = Vector3::new(corner.x, corner.y, extent.level_m);
+        let place = place_from_ecef(&ecef_from_mission.transform(Coordinate::from_metres(point)))?;
+        Some([place.longitude_deg(), place.latitude_deg()])
+    };
+    Some(Area {
+        polygon: extent
+            .polygon_m
+            .iter()
+            .map(on_earth)
+            .collect::<Option<_>>()?,
+        edge_sigma_m: extent.edge_sigma_m,
+        square_metres: extent.area_m2,
+        front: extent.front.iter().map(on_earth).collect::<Option<_>>()?,
+    })
 }

@@ -1,6 +1,6 @@
 //! One pair to sightings: decode, judge the eyes, detect, range.
 
-use super::Counters;
+use super::{Counters, light};
 use crate::alarm::AlarmClass;
 use crate::assess::PLAIN_LEVEL;
 use crate::detect::{BoxPx, Detection, DetectionClass, Detector, LeftImage};
@@ -21,6 +21,8 @@ pub struct Seen {
     pub found: Vec<Detection>,
     /// Those that may become fires, each with its index in `found`.
     pub sightings: Vec<(usize, Classified)>,
+    /// Flame that each of `sightings` shows, over the light of the scene; `None` where none is seen.
+    pub flames: Vec<Option<f64>>,
     /// True when the right eye was of no use.
     pub mono: bool,
 }
@@ -85,7 +87,14 @@ impl Vision {
                 sightings.push((index, classified));
             }
         }
+        let boxes: Vec<BoxPx> = found.iter().map(|detection| detection.box_px).collect();
+        let scene = light::scene_level(&raw.left_bgr, &boxes);
+        let flames = sightings
+            .iter()
+            .map(|(index, _)| light::flame(&raw.left_bgr, &boxes[*index], scene?))
+            .collect();
         Some(Seen {
+            flames,
             found,
             sightings,
             mono: raw.right_gray.is_none(),

@@ -539,28 +539,6 @@ impl PoseEstimator {
     }
 }
 
-/// Poses at any moment, for whoever learns that the camera's clock is off.
-pub trait PoseAt {
-    /// The pose at a moment of the service clock from what is known by now; `None` where there is
-    /// no honest one.
-    fn pose_at(&self, moment: ServiceTime) -> Option<Pose>;
-}
-
-impl PoseAt for PoseEstimator {
-    fn pose_at(&self, moment: ServiceTime) -> Option<Pose> {
-        match self.at(moment, moment + WAIT) {
-            PoseAnswer::Fresh(pose) => Some(*pose),
-            _ => None,
-        }
-    }
-}
-
-impl<F: Fn(ServiceTime) -> Option<Pose>> PoseAt for F {
-    fn pose_at(&self, moment: ServiceTime) -> Option<Pose> {
-        self(moment)
-    }
-}
-
 /// A boot clock that falls back by this much is a reboot, not a late message.
 const REBOOT: SignedDuration = SignedDuration::from_secs(1);
 /// Time that telemetry may take to reach us after the shutter before we go on without it.

@@ -151,7 +151,7 @@ fn stale_missing_and_fixless_telemetry_give_no_pose() {
         poses.at(service(2050), service(2110)),
         PoseAnswer::NoGnssFix
     );
-    let mut nothing = PoseEstimator::new(PoseConfig::default());
+    let nothing = PoseEstimator::new(PoseConfig::default());
     assert!(matches!(
         nothing.at(service(0), service(0)),
         PoseAnswer::NeverSeen { .. }

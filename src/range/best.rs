@@ -1,8 +1,9 @@
 //! All methods that apply, weighed by what each says of its own error; contradiction is refusal.
 
-use super::cross_spectral::{self, Cost};
 use super::scene::Scene;
-use super::{Disparity, Method, Methods, Miss, RangeConfig, Refusal, centroid, correlate};
+use super::{
+    Disparity, Method, Methods, Miss, RangeConfig, Refusal, centroid, correlate, cross_spectral,
+};
 
 /// One method's disparity.
 #[derive(Debug, Clone, Copy)]
@@ -20,32 +21,46 @@ const AGREE_DEPTH: f64 = 0.12;
 /// A single voice is believed this much less.
 const ALONE: f64 = 1.5;
 
-/// Correlation and centroids; where they don't agree the features that survive a change of spectrum
+/// A correlation above this needs no other voice, unless one contradicts.
+const SURE: f64 = 0.9;
+
+/// Correlation and centroids; where they leave doubt the features that survive a change of spectrum
 /// decide.
-pub(super) fn find(
-    scene: &Scene<'_>,
-    cost: Cost,
-    config: &RangeConfig,
-) -> Result<(Disparity, Methods), Miss> {
-    let mut said = vec![
-        (Method::Correlate, refusal(correlate::find(scene, config))?),
-        (Method::Centroid, centroid::find(scene, config)),
-    ];
+pub(super) fn find(scene: &Scene<'_>, config: &RangeConfig) -> Result<(Disparity, Methods), Miss> {
+    let honest = |method: Method, found: &Disparity| scene.honest(method, found);
+    let first = refusal(correlate::find(scene, config))?;
+    let sure = first.is_ok_and(|said| said.likeness > SURE);
+    let first = first.map(|said| honest(Method::Correlate, &said.found));
+    let second = centroid::find(scene, config).map(|said| honest(Method::Centroid, &said));
     let depth_px = |px: f64| AGREE_DEPTH * px.abs() * scene.target.width() as f64 / scene.focal_px;
     let agree = |a: &Disparity, b: &Disparity| {
         let apart = AGREE_SIGMAS * a.sigma_px.hypot(b.sigma_px) + AGREE_PX + depth_px(a.px);
         (a.px - b.px).abs() < apart
     };
-    let settled = matches!(&said[..], [(_, Ok(a)), (_, Ok(b))] if agree(a, b));
+    let settled = match (&first, &second) {
+        (Ok(a), Ok(b)) => agree(a, b),
+        (Ok(_), Err(why)) => sure && !warns(*why),
+        (Err(_), _) => false,
+    };
+    let mut said = vec![(Method::Correlate, first), (Method::Centroid, second)];
     if !settled {
-        let third = cross_spectral::find(scene, cost, config);
+        let third = refusal(cross_spectral::find(scene, config))?;
+        let third = third.map(|said| honest(Method::CrossSpectral, &said));
         said.push((Method::CrossSpectral, third));
     }
-    Ok(decide(&said, agree)?)
+    Ok(decide(&said, agree, if sure { 1.0 } else { ALONE })?)
+}
+
+/// Whether a refusal speaks against every other method's answer.
+fn warns(why: Refusal) -> bool {
+    matches!(
+        why,
+        Refusal::Ambiguous | Refusal::OneSided | Refusal::TooNear
+    )
 }
 
 /// A failure is passed on, a refusal is one voice less.
-fn refusal(said: Result<Disparity, Miss>) -> Result<Result<Disparity, Refusal>, Miss> {
+fn refusal<T>(said: Result<T, Miss>) -> Result<Result<T, Refusal>, Miss> {
     match said {
         Ok(found) => Ok(Ok(found)),
         Err(Miss::Refused(why)) => Ok(Err(why)),
@@ -56,6 +71,7 @@ fn refusal(said: Result<Disparity, Miss>) -> Result<Result<Disparity, Refusal>, 
 fn decide(
     said: &[(Method, Result<Disparity, Refusal>)],
     agree: impl Fn(&Disparity, &Disparity) -> bool,
+    alone: f64,
 ) -> Result<(Disparity, Methods), Refusal> {
     let voices: Vec<Voice> = said
         .iter()
@@ -77,7 +93,7 @@ fn decide(
     let largest = groups.max_by_key(Vec::len).unwrap_or_default();
     match largest[..] {
         [] => Err(first_refusal(said)),
-        [alone] if voices.len() == 1 => trusted_alone(alone, said),
+        [voice] if voices.len() == 1 => trusted_alone(voice, said, alone),
         [_] => Err(Refusal::Disagreement),
         _ => Ok(weighed(&largest)),
     }
@@ -94,18 +110,14 @@ fn first_refusal(said: &[(Method, Result<Disparity, Refusal>)]) -> Refusal {
 fn trusted_alone(
     voice: Voice,
     said: &[(Method, Result<Disparity, Refusal>)],
+    widened: f64,
 ) -> Result<(Disparity, Methods), Refusal> {
-    let warning = |why: &Refusal| {
-        matches!(
-            why,
-            Refusal::Ambiguous | Refusal::OneSided | Refusal::TooNear
-        )
-    };
-    if let Some(why) = said.iter().filter_map(|(_, said)| said.err()).find(warning) {
+    let refusals = said.iter().filter_map(|(_, said)| said.err());
+    if let Some(why) = refusals.into_iter().find(|why| warns(*why)) {
         return Err(why);
     }
     let found = Disparity {
-        sigma_px: ALONE * voice.found.sigma_px,
+        sigma_px: widened * voice.found.sigma_px,
         ..voice.found
     };
     Ok((found, Methods::only(voice.method)))

@@ -57,7 +57,8 @@ pub(super) fn find(scene: &Scene<'_>, config: &RangeConfig) -> Result<Disparity,
 /// How much each pixel belongs to what is as bright as the `pixels` brightest, 0 to 255.
 fn covered(gray: &Gray, pixels: usize) -> Option<Gray> {
     let levels = levels(gray, pixels)?;
-    let cover = |value: &f32| 255.0 * ((value - levels.low) / (levels.high - levels.low)).clamp(0.0, 1.0);
+    let cover =
+        |value: &f32| 255.0 * ((value - levels.low) / (levels.high - levels.low)).clamp(0.0, 1.0);
     Some(Gray {
         area: gray.area,
         seen: gray.seen,
@@ -143,6 +144,5 @@ fn scatter(bands: &[Band]) -> Option<(f64, f64)> {
         .map(|b| (b.mass * (b.disparity_px - mean)).powi(2))
         .sum();
     let n = bands.len() as f64;
-    (bands.len() > 1 && mass > 0.0)
-        .then(|| (mean, (squares * n / (n - 1.0)).sqrt() / mass))
+    (bands.len() > 1 && mass > 0.0).then(|| (mean, (squares * n / (n - 1.0)).sqrt() / mass))
 }

@@ -9,6 +9,11 @@ use emberfix_calib::RectifiedPixel;
 
 /// The flame and its outline: inside a saturated core nothing varies, at its rim everything does.
 const OUTLINE_PX: usize = 2;
+/// Below the pixel only the flame's own edge counts: the ground beside it lies at another disparity.
+const RIM_PX: usize = 1;
+/// What the eyes show differently is an error that the residuals' size alone does not tell: sigma grows
+/// by this times what is missing to full correlation.
+const UNLIKE: f64 = 4.0;
 /// Disagreement of the search there and back that is none.
 const BACK_PX: i32 = 2;
 /// A second peak counts as a rival when it leaves less than this share more unexplained.
@@ -16,25 +21,37 @@ const RIVAL: f64 = 1.35;
 /// Peaks nearer to each other than this are one.
 const SAME_PEAK_PX: i32 = 2;
 
-pub(super) fn find(scene: &Scene<'_>, config: &RangeConfig) -> Result<Disparity, Miss> {
+/// A disparity and how much the target resembles what is there.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Correlated {
+    pub found: Disparity,
+    /// Normalised correlation at the whole pixel, 0..1.
+    pub likeness: f64,
+}
+
+pub(super) fn find(scene: &Scene<'_>, config: &RangeConfig) -> Result<Correlated, Miss> {
     if scene.flame.count() < config.min_support as usize {
         return Err(Refusal::TooSmall.into());
     }
-    let outlined = scene.flame.grown(knob("OUTLINE", OUTLINE_PX as f64) as usize);
-    let runs = outlined.runs();
+    let outlined = scene.flame.grown(OUTLINE_PX).runs();
     let offsets = (-scene.search.greatest)..=(-scene.search.least);
-    let curve = correlate(&scene.left.gray, &scene.right, &runs, offsets);
+    let curve = correlate(&scene.left.gray, &scene.right, &outlined, offsets);
     let peak = rival_free(&curve, config.min_correlation, -scene.search.greatest)?;
-    there_and_back(scene, &runs, &peak)?;
-    let sharp = scene.flame.grown(knob("SHARP", 1.0) as usize).runs();
-    let refined = Refiner::new(&scene.left.gray, &scene.right, &sharp, -peak.at)
+    there_and_back(scene, &outlined, &peak)?;
+    let right = scene.opposite(peak.at)?;
+    let rim = scene.flame.grown(RIM_PX).runs();
+    let refined = Refiner::new(&scene.left.gray, &right, &rim, -peak.at)
         .and_then(|refiner| refiner.refine())
         .ok_or(Refusal::Inconsistent)?;
-    Ok(disparity(&scene.flame, refined.disparity_px, refined.sigma_px))
-}
-
-pub(super) fn knob(name: &str, usual: f64) -> f64 {
-    std::env::var(name).ok().and_then(|v| v.parse().ok()).unwrap_or(usual)
+    let unlike = 1.0 + UNLIKE * (1.0 - peak.correlation);
+    Ok(Correlated {
+        found: disparity(
+            &scene.flame,
+            refined.disparity_px,
+            unlike * refined.sigma_px,
+        ),
+        likeness: peak.correlation,
+    })
 }
 
 /// The best place in the right eye, if it is good enough and has no rival.

@@ -1,9 +1,5 @@
 //! Which pixels of a box look like flame.
 
-use opencv::core::{Mat, MatTraitConst, ToInputArray, Vec3b};
-use opencv::imgproc;
-use opencv::prelude::MatTraitConstManual;
-
 /// A gate on hue, saturation and value, each 0..1.
 ///
 /// Hue may wrap: a lower bound above the upper one means "through red". The gate is named, because
@@ -61,26 +57,6 @@ impl HsvMask {
         let core = self.core_value.is_some_and(|core| value >= core);
         core || (hue_fits && within(saturation, self.saturation) && within(value, self.value))
     }
-
-    /// The gate over an 8-bit BGR image, row by row.
-    pub(super) fn apply(
-        &self,
-        bgr: &(impl MatTraitConst + ToInputArray),
-    ) -> opencv::Result<Vec<bool>> {
-        let (rows, columns) = (bgr.rows(), bgr.cols());
-        let mut hsv = Mat::default();
-        imgproc::cvt_color_def(bgr, &mut hsv, imgproc::COLOR_BGR2HSV)?;
-        let mut kept = Vec::with_capacity((rows * columns) as usize);
-        for row in 0..rows {
-            // OpenCV's 8-bit hue counts 180 to the turn.
-            let pixel = |p: &Vec3b| {
-                let [hue, saturation, value] = p.0.map(f64::from);
-                self.keeps_hsv((hue / 180.0, saturation / 255.0, value / 255.0))
-            };
-            kept.extend(hsv.at_row::<Vec3b>(row)?.iter().map(pixel));
-        }
-        Ok(kept)
-    }
 }
 
 impl Default for HsvMask {
@@ -108,7 +84,6 @@ fn hsv(red: f64, green: f64, blue: f64) -> (f64, f64, f64) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use opencv::core::{CV_8UC3, Scalar};
 
     const ORANGE: [u8; 3] = [40, 120, 200];
     const WHITE_CORE: [u8; 3] = [225, 250, 255];
@@ -128,30 +103,6 @@ mod tests {
     fn grass_sky_and_asphalt_are_no_flame() {
         for other in [[40, 120, 60], [220, 170, 110], [70, 70, 70], [30, 30, 30]] {
             assert!(!HsvMask::flame().keeps(other), "{other:?}");
-        }
-    }
-
-    /// P3's 0..1 thresholds on OpenCV's 8-bit scales, where hue counts to 180.
-    #[test]
-    fn the_image_gate_is_the_pixel_gate() {
-        for mask in [HsvMask::printed(), HsvMask::flame()] {
-            for bgr in [
-                ORANGE,
-                WHITE_CORE,
-                RED_FLAME,
-                [40, 120, 60],
-                [0, 0, 0],
-                [10, 90, 130],
-            ] {
-                let colour =
-                    Scalar::from((f64::from(bgr[0]), f64::from(bgr[1]), f64::from(bgr[2])));
-                let image = Mat::new_rows_cols_with_default(2, 3, CV_8UC3, colour).unwrap();
-                assert_eq!(
-                    mask.apply(&image).unwrap(),
-                    vec![mask.keeps(bgr); 6],
-                    "{bgr:?}"
-                );
-            }
         }
     }
 }

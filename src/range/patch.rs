@@ -155,67 +155,114 @@ impl Cutter {
         Ok((area.width() > 0 && area.height() > 0).then_some(area))
     }
 
-    /// The left eye over an area, whose rows are cut to the image.
+    /// The left eye over an area, whose rows are cut to the image: gray at the exact places, colour as
+    /// the nearest pixel has it.
     pub fn left(&self, image: &Mat, area: Area) -> Result<Colour, RangeError> {
         let area = area.within_rows(self.size().1);
+        let raw = Raw::<3>::of(image)?;
+        let luma = self.luma(&raw, area);
         let mut bgr = Vec::with_capacity(area.width() * area.height());
         let mut values = Vec::with_capacity(bgr.capacity());
-        let seen = self.sample::<3>(image, Eye::Left, area, |pixel| {
-            values.push((0..3).map(|c| LUMA[c] * pixel[c]).sum());
-            bgr.push(pixel.map(|value| (value + 0.5) as u8));
-        })?;
+        let seen = self.each_place(Eye::Left, area, |u, v| {
+            values.push(luma.cubic(u, v));
+            bgr.push(raw.nearest(u, v));
+        });
         Ok(Colour {
             bgr,
             gray: Gray { area, seen, values },
         })
     }
 
-    /// The left eye over an area in gray alone.
+    /// The left eye over an area in gray, each place as its nearest pixel: enough to find whole pixels.
+    pub fn left_draft(&self, image: &Mat, area: Area) -> Result<Gray, RangeError> {
+        let area = area.within_rows(self.size().1);
+        let raw = Raw::<3>::of(image)?;
+        let mut values = Vec::with_capacity(area.width() * area.height());
+        let seen = self.each_place(Eye::Left, area, |u, v| {
+            values.push(luma(&raw.nearest(u, v)))
+        });
+        Ok(Gray { area, seen, values })
+    }
+
+    /// The left eye over an area in gray, at the exact places.
     pub fn left_gray(&self, image: &Mat, area: Area) -> Result<Gray, RangeError> {
         let area = area.within_rows(self.size().1);
+        let raw = Raw::<3>::of(image)?;
+        let luma = self.luma(&raw, area);
         let mut values = Vec::with_capacity(area.width() * area.height());
-        let seen = self.sample::<3>(image, Eye::Left, area, |pixel| {
-            values.push((0..3).map(|c| LUMA[c] * pixel[c]).sum());
-        })?;
+        let seen = self.each_place(Eye::Left, area, |u, v| values.push(luma.cubic(u, v)));
         Ok(Gray { area, seen, values })
     }
 
-    /// The right eye over an area, whose rows are cut to the image.
+    /// The right eye over an area, straight lines between pixels: enough to find whole pixels.
+    pub fn right_draft(&self, image: &Mat, area: Area) -> Result<Gray, RangeError> {
+        let area = area.within_rows(self.size().1);
+        let raw = Raw::<1>::of(image)?;
+        let mut values = Vec::with_capacity(area.width() * area.height());
+        let seen = self.each_place(Eye::Right, area, |u, v| values.push(raw.linear(u, v)));
+        Ok(Gray { area, seen, values })
+    }
+
+    /// The right eye over an area, at the exact places.
     pub fn right(&self, image: &Mat, area: Area) -> Result<Gray, RangeError> {
         let area = area.within_rows(self.size().1);
+        let raw = Raw::<1>::of(image)?;
+        let crop = self.crop(Eye::Right, &raw, area, |[value]| f32::from(*value));
         let mut values = Vec::with_capacity(area.width() * area.height());
-        let seen = self.sample::<1>(image, Eye::Right, area, |[value]| values.push(value))?;
+        let seen = self.each_place(Eye::Right, area, |u, v| values.push(crop.cubic(u, v)));
         Ok(Gray { area, seen, values })
     }
 
-    /// Hands every pixel of an area to `take`, row by row; says which columns the image really has.
-    fn sample<const N: usize>(
+    fn luma(&self, raw: &Raw<'_, 3>, area: Area) -> Crop {
+        self.crop(Eye::Left, raw, area, luma)
+    }
+
+    /// The raw pixels that an area may need, each as one number.
+    fn crop<const N: usize>(
         &self,
-        image: &Mat,
         eye: Eye,
+        raw: &Raw<'_, N>,
         area: Area,
-        mut take: impl FnMut([f32; N]),
-    ) -> Result<(i32, i32), RangeError> {
-        let raw = Raw::<N>::of(image)?;
+        level: impl Fn(&[u8; N]) -> f32,
+    ) -> Crop {
+        let mut low = (f32::INFINITY, f32::INFINITY);
+        let mut high = (f32::NEG_INFINITY, f32::NEG_INFINITY);
+        let edges = [area.top, (area.top + area.bottom) / 2, area.bottom];
+        for (u, v) in edges.into_iter().flat_map(|row| self.knots(eye, area, row)) {
+            low = (low.0.min(u), low.1.min(v));
+            high = (high.0.max(u), high.1.max(v));
+        }
+        let bound = |value: f32, last: usize| (value.max(0.0) as usize).min(last);
+        let left = bound(low.0 - EDGE_PX, raw.columns - 1);
+        let top = bound(low.1 - EDGE_PX, raw.rows - 1);
+        let right = bound(high.0 + EDGE_PX, raw.columns - 1);
+        let bottom = bound(high.1 + EDGE_PX, raw.rows - 1);
+        raw.crop(left, top, right + 1, bottom + 1, level)
+    }
+
+    /// Hands the raw place of every pixel of an area to `take`, row by row; says which columns the image
+    /// really has.
+    fn each_place(&self, eye: Eye, area: Area, mut take: impl FnMut(f32, f32)) -> (i32, i32) {
+        let last_column = (self.size().0 - 1) as f32;
         let mut seen = (area.left, area.right);
         for row in area.top..area.bottom {
-            let knots = self.knots(eye, area, row);
-            for (k, knot) in knots.windows(2).enumerate() {
+            for (k, knot) in self.knots(eye, area, row).windows(2).enumerate() {
                 let (a, b) = (knot[0], knot[1]);
                 let first = k * KNOTS_PX;
                 for j in 0..KNOTS_PX.min(area.width() - first) {
                     let t = j as f32 / KNOTS_PX as f32;
                     let (u, v) = (a.0 + (b.0 - a.0) * t, a.1 + (b.1 - a.1) * t);
+                    let column = area.left + (first + j) as i32;
                     if u < 0.0 {
-                        seen.0 = seen.0.max(area.left + (first + j) as i32 + 1);
-                    } else if u > raw.last_column {
-                        seen.1 = seen.1.min(area.left + (first + j) as i32);
+                        seen.0 = seen.0.max(column + 1);
+                    } else if u > last_column {
+                        seen.1 = seen.1.min(column);
                     }
-                    take(raw.at(u, v));
+                    take(u, v);
                 }
             }
         }
-        Ok(seen)
+        seen
     }
 
     /// Raw places of a row's every `KNOTS_PX`-th column, one beyond the last included.
@@ -236,49 +283,117 @@ impl Cutter {
     }
 }
 
+fn luma(bgr: &[u8; 3]) -> f32 {
+    (0..3).map(|c| LUMA[c] * f32::from(bgr[c])).sum()
+}
+
+/// Pixels beyond an area that interpolation and the bend of its edges need.
+const EDGE_PX: f32 = 4.0;
+
 /// A raw image's bytes.
 struct Raw<'a, const N: usize> {
-    bytes: Cow<'a, [u8]>,
+    pixels: Cow<'a, [[u8; N]]>,
     columns: usize,
-    last_column: f32,
-    last_row: f32,
+    rows: usize,
 }
 
 impl<'a, const N: usize> Raw<'a, N> {
     fn of(image: &'a Mat) -> Result<Self, RangeError> {
-        let bytes = if image.is_continuous() {
-            Cow::Borrowed(image.data_bytes()?)
+        let pixels = if image.is_continuous() {
+            Cow::Borrowed(image.data_bytes()?.as_chunks().0)
         } else {
-            Cow::Owned(image.try_clone()?.data_bytes()?.to_vec())
+            Cow::Owned(image.try_clone()?.data_bytes()?.as_chunks().0.to_vec())
         };
         Ok(Self {
-            bytes,
+            pixels,
             columns: image.cols() as usize,
-            last_column: (image.cols() - 1) as f32,
-            last_row: (image.rows() - 1) as f32,
+            rows: image.rows() as usize,
         })
     }
 
-    /// Value between pixels (Catmull and Rom), clipped to what a byte holds.
-    fn at(&self, u: f32, v: f32) -> [f32; N] {
-        let (u, v) = (u.clamp(0.0, self.last_column), v.clamp(0.0, self.last_row));
-        let (across, down) = (cubic(u.fract()), cubic(v.fract()));
-        let column = |k: usize| {
-            ((u as usize + k).saturating_sub(1)).min(self.last_column as usize) * N
-        };
-        let columns = [column(0), column(1), column(2), column(3)];
-        let mut sum = [0.0; N];
-        for (k, weight) in down.into_iter().enumerate() {
-            let row = (v as usize + k).saturating_sub(1).min(self.last_row as usize);
-            let first = row * self.columns * N;
-            for (column, share) in columns.into_iter().zip(across) {
-                let pixel = &self.bytes[first + column..first + column + N];
-                for (sum, value) in sum.iter_mut().zip(pixel) {
-                    *sum += weight * share * f32::from(*value);
-                }
-            }
+    fn nearest(&self, u: f32, v: f32) -> [u8; N] {
+        let column = ((u + 0.5).max(0.0) as usize).min(self.columns - 1);
+        let row = ((v + 0.5).max(0.0) as usize).min(self.rows - 1);
+        self.pixels[row * self.columns + column]
+    }
+
+    fn crop(
+        &self,
+        left: usize,
+        top: usize,
+        right: usize,
+        bottom: usize,
+        level: impl Fn(&[u8; N]) -> f32,
+    ) -> Crop {
+        let mut values = Vec::with_capacity((right - left) * (bottom - top));
+        for row in top..bottom {
+            let line = &self.pixels[row * self.columns + left..row * self.columns + right];
+            values.extend(line.iter().map(&level));
         }
-        sum.map(|value| value.clamp(0.0, 255.0))
+        Crop {
+            left: left as f32,
+            top: top as f32,
+            columns: right - left,
+            rows: bottom - top,
+            values,
+        }
+    }
+}
+
+impl Raw<'_, 1> {
+    fn linear(&self, u: f32, v: f32) -> f32 {
+        let u = u.clamp(0.0, (self.columns - 1) as f32);
+        let v = v.clamp(0.0, (self.rows - 1) as f32);
+        let (column, row) = (u as usize, v as usize);
+        let (right, below) = (
+            (column + 1).min(self.columns - 1),
+            (row + 1).min(self.rows - 1),
+        );
+        let at = |column: usize, row: usize| f32::from(self.pixels[row * self.columns + column][0]);
+        let (s, t) = (u.fract(), v.fract());
+        let upper = at(column, row) * (1.0 - s) + at(right, row) * s;
+        let lower = at(column, below) * (1.0 - s) + at(right, below) * s;
+        upper * (1.0 - t) + lower * t
+    }
+}
+
+/// A part of a raw image, one number a pixel.
+struct Crop {
+    left: f32,
+    top: f32,
+    columns: usize,
+    rows: usize,
+    values: Vec<f32>,
+}
+
+impl Crop {
+    /// Value between pixels (Catmull and Rom), clipped to what a byte holds; its edges repeat.
+    fn cubic(&self, u: f32, v: f32) -> f32 {
+        let u = (u - self.left).clamp(0.0, (self.columns - 1) as f32);
+        let v = (v - self.top).clamp(0.0, (self.rows - 1) as f32);
+        let (across, down) = (cubic(u.fract()), cubic(v.fract()));
+        let (column, row) = (u as usize, v as usize);
+        let inside = column >= 1 && column + 2 < self.columns && row >= 1 && row + 2 < self.rows;
+        let mut sum = 0.0;
+        for (k, weight) in down.into_iter().enumerate() {
+            let line = if inside {
+                let first = (row + k - 1) * self.columns + column - 1;
+                let taps = &self.values[first..first + 4];
+                across[0] * taps[0]
+                    + across[1] * taps[1]
+                    + across[2] * taps[2]
+                    + across[3] * taps[3]
+            } else {
+                let row = (row + k).saturating_sub(1).min(self.rows - 1);
+                let at = |j: usize| {
+                    let column = (column + j).saturating_sub(1).min(self.columns - 1);
+                    self.values[row * self.columns + column]
+                };
+                (0..4).map(|j| across[j] * at(j)).sum()
+            };
+            sum += weight * line;
+        }
+        sum.clamp(0.0, 255.0)
     }
 }
 

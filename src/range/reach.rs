@@ -1,7 +1,6 @@
 //! How far a disparity reaches: measured, only "at least this far", or not to be believed.
 
-use super::{Disparity, Methods, RangeConfig, Ranging, Refusal};
-use super::correlate::knob;
+use super::{Disparity, Method, Methods, RangeConfig, Ranging, Refusal};
 use emberfix_calib::Rig;
 
 /// What decides it.
@@ -12,10 +11,54 @@ pub(super) struct Reach {
     sigma_floor_px: f64,
 }
 
-/// A flame is about as deep as it is wide, and what is seen of it is not just its axis: one sigma of
-/// the difference, as a share of the disparity that its depth spans.
-const SHAPE: f64 = 0.06;
+/// How much of its scatter and of a flame's depth a method's error is: measured on rendered flames (the
+/// tuning set of `emberfix eval range`).
+struct Honesty {
+    /// Standard deviation of its error against the scatter that it states itself.
+    scatter: f64,
+    /// What is seen of a flame is not just its axis, and a flame is about as deep as it is wide: one
+    /// sigma of the difference, as a share of the disparity that its depth spans.
+    depth: f64,
+    /// What its error leans to: an outline is seen where the flame is widest, at its axis or behind it,
+    /// its light before that. Share of the same depth by which the method reads too far.
+    behind: f64,
+}
 
+fn honesty(method: Method) -> Honesty {
+    let (scatter, depth, behind) = match method {
+        Method::Sgbm => (2.0, 0.10, 0.0),
+        Method::Centroid => (2.2, 0.10, 0.04),
+        Method::Correlate => (1.2, 0.10, 0.035),
+        Method::CrossSpectral => (1.5, 0.12, 0.06),
+        // It is made of the others, whose sigmas are honest already.
+        Method::Best => (1.0, 0.0, 0.0),
+    };
+    Honesty {
+        scatter,
+        depth,
+        behind,
+    }
+}
+
+/// A method's disparity with the sigma that its errors truly have, for a target of a width.
+pub(super) fn honest(
+    method: Method,
+    found: &Disparity,
+    width_px: usize,
+    focal_px: f64,
+) -> Disparity {
+    let Honesty {
+        scatter,
+        depth,
+        behind,
+    } = honesty(method);
+    let depth_px = found.px.abs() * width_px as f64 / focal_px;
+    Disparity {
+        px: found.px + behind * depth_px,
+        sigma_px: (scatter * found.sigma_px).hypot(depth * depth_px),
+        ..*found
+    }
+}
 
 impl Reach {
     pub fn new(rig: &Rig, config: &RangeConfig) -> Self {
@@ -27,18 +70,17 @@ impl Reach {
     }
 
     /// Corrects what the rig's known distances showed and judges the rest.
-    pub fn judge(&self, found: &Disparity, width_px: usize, used: Methods) -> Ranging {
+    pub fn judge(&self, found: &Disparity, used: Methods) -> Ranging {
         let rectification = self.rig.rectification();
-        let depth_px = found.px.abs() * width_px as f64 / rectification.focal_px();
-        let sigma_px = (knob("SCALE", 1.0) * found.sigma_px)
-            .hypot(knob("SHAPE", SHAPE) * depth_px)
-            .hypot(self.sigma_floor_px);
         let found = &Disparity {
-            sigma_px,
+            px: self.rig.corrected_disparity_px(found.px),
+            sigma_px: found.sigma_px.hypot(self.sigma_floor_px) / self.rig.inverse_depth().scale,
             ..*found
         };
         let from_infinity = found.px - rectification.infinity_disparity_px();
-        let sigma = found.sigma_px.hypot(self.rig.sigmas().disparity_bias_px);
+        let sigma = found
+            .sigma_px
+            .hypot(self.rig.disparity_bias_sigma_px(found.px));
         if from_infinity < -2.0 * sigma {
             // Swapped eyes or a wrong match, not a far fire.
             return Ranging::NoMatch {

@@ -29,7 +29,7 @@ pub(super) struct Refiner {
 type State = Vector3<f64>;
 
 /// Pixels that are compared, at most: more of them no longer lower the error.
-const MOST_PIXELS: usize = 8000;
+const MOST_PIXELS: usize = 2500;
 /// Farthest that least squares may go from the whole pixel.
 const REACH_PX: f64 = 2.0;
 /// Columns beyond the target that interpolation and the way of the steps may need.
@@ -37,8 +37,9 @@ const MARGIN_PX: i32 = 5;
 /// Smoothed neighbours share their noise: about one pixel in four is its own witness.
 const WITNESS_FACTOR: f64 = 2.0;
 const MOST_STEPS: usize = 12;
+const MOST_PART_STEPS: usize = 5;
 /// Steps below this are no steps.
-const STILL_PX: f64 = 1e-4;
+const STILL_PX: f64 = 1e-3;
 
 impl Refiner {
     pub fn new(left: &Gray, right: &Gray, runs: &[Run], start_px: i32) -> Option<Self> {
@@ -63,14 +64,10 @@ impl Refiner {
     /// The disparity of all pixels as one, then of its parts; `None` when it runs away.
     pub fn refine(&self) -> Option<Refined> {
         let whole = self.together()?;
-        let parts = self.parts(&whole);
-        let pooled = (super::correlate::knob("PARTS", 1.0) > 0.0)
-            .then(|| pooled(&parts))
-            .flatten()
-            .unwrap_or(Refined {
-                disparity_px: whole.state.x,
-                sigma_px: whole.sigma_px,
-            });
+        let pooled = pooled(&self.parts(&whole)).unwrap_or(Refined {
+            disparity_px: whole.state.x,
+            sigma_px: whole.sigma_px,
+        });
         Some(Refined {
             disparity_px: pooled.disparity_px + f64::from(self.start_px),
             ..pooled
@@ -109,8 +106,9 @@ impl Refiner {
         state: &State,
         scale: f64,
     ) -> (Matrix3<f64>, Vector3<f64>, Vec<f64>) {
-        let (mut normal, mut pull) = (Matrix3::zeros(), Vector3::zeros());
-        let mut residuals = Vec::new();
+        let mut n = [0.0_f64; 6];
+        let mut pull = Vector3::zeros();
+        let mut residuals = Vec::with_capacity(MOST_PIXELS);
         let at = Between::new(-state.x);
         for run in runs {
             let (left, right) = (self.left.row(run.row), self.right.row(run.row));
@@ -121,12 +119,19 @@ impl Refiner {
                 let residual = f64::from(left[k]) - state.y * value - state.z;
                 residuals.push(residual);
                 let weight = tukey(residual / scale);
-                // d(prediction) / d(disparity, gain, offset); the mean slope makes the step symmetric.
-                let jacobian = Vector3::new(-0.5 * (state.y * slope + own_slope), value, 1.0);
-                normal += weight * jacobian * jacobian.transpose();
-                pull += weight * residual * jacobian;
+                // d(prediction) / d(disparity); the mean slope makes the step symmetric. By gain it is
+                // the value, by offset 1.
+                let shift = -0.5 * (state.y * slope + own_slope);
+                n[0] += weight * shift * shift;
+                n[1] += weight * shift * value;
+                n[2] += weight * shift;
+                n[3] += weight * value * value;
+                n[4] += weight * value;
+                n[5] += weight;
+                pull += weight * residual * Vector3::new(shift, value, 1.0);
             }
         }
+        let normal = Matrix3::new(n[0], n[1], n[2], n[1], n[3], n[4], n[2], n[4], n[5]);
         (normal, pull, residuals)
     }
 
@@ -170,13 +175,13 @@ impl Refiner {
         }
         let mut state = whole.state;
         let mut sigma_px = f64::INFINITY;
-        for _ in 0..MOST_STEPS {
+        for _ in 0..MOST_PART_STEPS {
             let (normal, pull, residuals) = self.equations(&runs, &state, 1.5 * whole.scale);
             let slope2 = normal[(0, 0)];
             let step = pull.x / slope2;
             state.x += step;
             sigma_px = WITNESS_FACTOR * robust_scale(residuals)? / slope2.sqrt();
-            if !((state.x - whole.state.x).abs() < REACH_PX) {
+            if !state.x.is_finite() || (state.x - whole.state.x).abs() > REACH_PX {
                 return None;
             }
             if step.abs() < 0.01 {
@@ -217,7 +222,13 @@ fn pooled(parts: &[Refined]) -> Option<Refined> {
         return None;
     }
     let mut mean = median(parts.iter().map(|part| part.disparity_px).collect())?;
-    let spread = 1.4826 * median(parts.iter().map(|p| (p.disparity_px - mean).abs()).collect())?;
+    let spread = 1.4826
+        * median(
+            parts
+                .iter()
+                .map(|p| (p.disparity_px - mean).abs())
+                .collect(),
+        )?;
     let noise = median(parts.iter().map(|part| part.sigma_px).collect())?;
     let between = (spread.powi(2) - noise.powi(2)).max(0.0);
     let mut sigma_px = f64::NAN;

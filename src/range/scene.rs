@@ -1,7 +1,8 @@
 //! What all methods look at: one target's surroundings in both eyes, and which pixels are flame.
 
 use super::patch::{Area, Colour, Cutter, Gray};
-use super::{Miss, RangeConfig, RangeError, RawPair, Refusal, Target};
+use super::reach::honest;
+use super::{Disparity, Method, Miss, RangeConfig, RangeError, RawPair, Refusal, Target};
 use crate::detect::DetectionClass;
 use opencv::core::Mat;
 
@@ -56,7 +57,10 @@ impl Mask {
                 }
             }
         }
-        Self { area: self.area, kept }
+        Self {
+            area: self.area,
+            kept,
+        }
     }
 
     pub fn runs(&self) -> Vec<Run> {
@@ -67,7 +71,11 @@ impl Mask {
                 match (from, *kept) {
                     (None, true) => from = Some(column),
                     (Some(first), false) => {
-                        runs.push(Run { row, from: first, to: column });
+                        runs.push(Run {
+                            row,
+                            from: first,
+                            to: column,
+                        });
                         from = None;
                     }
                     _ => {}
@@ -101,8 +109,9 @@ pub(super) struct Scene<'a> {
     pub target: Area,
     /// The box and its context.
     pub left: Colour,
-    /// The same rows of the right eye, as far as the search reaches.
+    /// The same rows of the right eye, as far as the search reaches, good to whole pixels.
     pub right: Gray,
+    pub right_gray: &'a Mat,
     /// The flame, over the left eye's area.
     pub flame: Mask,
     pub search: Search,
@@ -132,7 +141,7 @@ impl<'a> Scene<'a> {
         let around = area.grown(context, context, context);
         let left = cutter.left(&pair.left_bgr, around)?;
         let strip = around.grown(search.greatest.max(0), (-search.least).max(0), 0);
-        let right = cutter.right(right_gray, strip)?;
+        let right = cutter.right_draft(right_gray, strip)?;
         let flame = flame(&left, &area, config);
         Ok(Self {
             cutter,
@@ -140,17 +149,33 @@ impl<'a> Scene<'a> {
             target: area,
             left,
             right,
+            right_gray,
             flame,
             search,
             focal_px: cutter.focal_px(),
         })
     }
 
+    /// A method's disparity with the sigma that its errors truly have.
+    pub fn honest(&self, method: Method, found: &Disparity) -> Disparity {
+        honest(method, found, self.target.width(), self.focal_px)
+    }
+
+    /// What the right eye shows `offset` columns from where the left one's context is, exactly.
+    pub fn opposite(&self, offset: i32) -> Result<Gray, RangeError> {
+        let area = self.left.gray.area.grown(-offset, offset, 0);
+        self.cutter.right(self.right_gray, area)
+    }
+
     /// The left eye as far as what the right one shows `offset` columns on may come from there.
     pub fn back(&self, offset: i32) -> Result<Gray, RangeError> {
         let area = self.left.gray.area;
-        let area = area.grown(-offset - self.search.least, offset + self.search.greatest, 0);
-        self.cutter.left_gray(self.left_bgr, area)
+        let area = area.grown(
+            -offset - self.search.least,
+            offset + self.search.greatest,
+            0,
+        );
+        self.cutter.left_draft(self.left_bgr, area)
     }
 }
 
@@ -176,10 +201,7 @@ fn flame(left: &Colour, target: &Area, config: &RangeConfig) -> Mask {
         .collect();
     let enough =
         |kept: &Vec<bool>| kept.iter().filter(|kept| **kept).count() >= config.min_support as usize;
-    let kept = [shining, gate]
-        .into_iter()
-        .find(enough)
-        .unwrap_or(inside);
+    let kept = [shining, gate].into_iter().find(enough).unwrap_or(inside);
     Mask { area, kept }
 }
 

@@ -19,7 +19,7 @@ pub(super) struct Peak {
 }
 
 /// Rows that are compared, at most: more of them change the whole pixel no longer.
-const MOST_PIXELS: usize = 4000;
+const MOST_PIXELS: usize = 1600;
 
 /// Correlates the runs' pixels of `one` with those of `other` that lie `offset` columns further on.
 pub(super) fn correlate(

@@ -56,9 +56,10 @@ impl SemiGlobal {
     fn samples(&mut self, scene: &Scene<'_>) -> Result<Vec<Sample>, RangeError> {
         let strip = scene.right.area;
         let left = scene.cutter.left_gray(scene.left_bgr, strip)?;
+        let right = scene.cutter.right(scene.right_gray, strip)?;
         let mut disparities = Mat::default();
         self.matcher
-            .compute(&bytes(&left)?, &bytes(&scene.right)?, &mut disparities)?;
+            .compute(&bytes(&left)?, &bytes(&right)?, &mut disparities)?;
         let invalid = (self.search.least - 1) * 16;
         let seen = f64::from(scene.right.seen.0)..f64::from(scene.right.seen.1);
         let mut samples = Vec::new();
@@ -92,7 +93,10 @@ fn borne_out(
         ..scene.flame.clone()
     };
     let area = matched.area;
-    for Sample { at: (column, row), .. } in samples {
+    for Sample {
+        at: (column, row), ..
+    } in samples
+    {
         let index = (row - area.top) as usize * area.width() + (column - area.left) as usize;
         matched.kept[index] = true;
     }

@@ -1,13 +1,12 @@
 //! The ways to a disparity behind one trait, each from the same [`Scene`].
 
-use super::cross_spectral::{self, Cost};
 use super::patch::Cutter;
 use super::reach::Reach;
 use super::scene::{Scene, Search};
 use super::sgbm::SemiGlobal;
 use super::{
-    Method, Methods, Miss, RangeConfig, RangeError, Ranger, Ranging, RawPair, Target,
-    best, centroid, correlate,
+    Method, Methods, Miss, RangeConfig, RangeError, Ranger, Ranging, RawPair, Target, best,
+    centroid, correlate, cross_spectral,
 };
 use emberfix_calib::Rig;
 
@@ -46,23 +45,21 @@ impl Ways {
         self.cutter.check(pair)?;
         let config = &self.config;
         let scene = Scene::new(&self.cutter, pair, target, self.search, config)?;
-        let found = match self.method {
-            Method::Sgbm => self.semi_global.find(&scene)?,
-            Method::Centroid => centroid::find(&scene, config)?,
-            Method::Correlate => correlate::find(&scene, config)?,
-            Method::CrossSpectral => cross_spectral::find(&scene, cost(), config)?,
-            Method::Best => {
-                let (found, used) = best::find(&scene, cost(), config)?;
-                return Ok(self.reach.judge(&found, scene.target.width(), used));
+        let (found, used) = match self.method {
+            Method::Best => best::find(&scene, config)?,
+            method => {
+                let found = match method {
+                    Method::Sgbm => self.semi_global.find(&scene)?,
+                    Method::Centroid => centroid::find(&scene, config)?,
+                    Method::CrossSpectral => cross_spectral::find(&scene, config)?,
+                    Method::Correlate | Method::Best => correlate::find(&scene, config)?.found,
+                };
+                (scene.honest(method, &found), Methods::only(method))
             }
         };
-        let used = Methods::only(self.method);
-        Ok(self.reach.judge(&found, scene.target.width(), used))
+        Ok(self.reach.judge(&found, used))
     }
 }
-
-/// The cost that survives the change of spectrum best, by measurement.
-const COST: Cost = Cost::Gradient;
 
 impl Ranger for Ways {
     fn range(&mut self, pair: &RawPair, target: &Target) -> Result<Ranging, RangeError> {
@@ -71,12 +68,5 @@ impl Ranger for Ways {
             Err(Miss::Refused(why)) => Ok(Ranging::NoMatch { why }),
             Err(Miss::Failed(error)) => Err(error),
         }
-    }
-}
-fn cost() -> Cost {
-    match correlate::knob("COST", 0.0) as i32 {
-        1 => Cost::Census,
-        2 => Cost::MutualInformation,
-        _ => COST,
     }
 }

@@ -49,7 +49,6 @@ pub(super) const ALARM: &str = r#"{
           "required": ["width", "height"],
           "properties": {"width": {"type": "number"}, "height": {"type": "number"}}
         },
-        "trend": {"type": ["number", "null"]},
         "advice": {
           "type": ["object", "null"],
           "required": ["course_deg", "distance_m", "ce90_m"],
@@ -59,9 +58,42 @@ pub(super) const ALARM: &str = r#"{
             "ce90_m": {"type": "number", "minimum": 0}
           }
         },
+        "trend": {"description": "relative slope of the intensity, per second",
+          "type": ["number", "null"]},
+        "size_sigma_m": {
+          "type": ["object", "null"],
+          "required": ["width", "height"],
+          "properties": {"width": {"type": "number"}, "height": {"type": "number"}}
+        },
+        "size_class": {"enum": ["small", "medium", "large", null]},
+        "trend_sigma": {"type": ["number", "null"]},
+        "trend_probability": {"type": ["object", "null"],
+          "properties": {"growing": {"type": "number"}, "dying": {"type": "number"}}},
+        "intensity": {"type": ["object", "null"],
+          "properties": {"value": {"type": "number"}, "sigma": {"type": "number"}}},
+        "intensity_history": {"description": "seconds before captured_at, intensity",
+          "type": "array", "maxItems": 24,
+          "items": {"type": "array", "minItems": 2, "maxItems": 2, "items": {"type": "number"}}},
+        "area": {"type": ["object", "null"],
+          "required": ["polygon", "edge_sigma_m", "square_metres", "front"]},
+        "spread": {"type": ["object", "null"],
+          "required": ["azimuth_deg", "speed_m_s", "used_wind"]},
         "degraded": {"type": "array", "items": {"type": "string"}}
       }
     }
+  }
+}"#;
+
+/// `/spectrometer`: one reading.
+pub(super) const SPECTRUM: &str = r#"{
+  "$schema": "https://json-schema.org/draft/2020-12/schema",
+  "title": "emberfix.Spectrum",
+  "description": "One reading; publish time is mid-integration",
+  "type": "object",
+  "required": ["wavelengths_nm", "intensity"],
+  "properties": {
+    "wavelengths_nm": {"type": "array", "items": {"type": "number"}},
+    "intensity": {"type": "array", "items": {"type": "number"}}
   }
 }"#;
 

@@ -3,6 +3,7 @@
 use super::convert::{self, ImageMessage};
 use super::{BodyPose, ChunkCompression, RecordError, RecordOptions, UavFix, schemas};
 use crate::alarm::Alarm;
+use crate::assess::spectrum::Spectrum;
 use crate::detect::Detection;
 use crate::ingest::{EncodedImage, StereoPair};
 use emberfix_calib::{Eye, Rig};
@@ -30,6 +31,7 @@ const RIGHT_IMAGE: &str = "/stereo/right/image";
 const LEFT_CALIBRATION: &str = "/stereo/left/calibration";
 const RIGHT_CALIBRATION: &str = "/stereo/right/calibration";
 const MAVLINK: &str = "/mavlink/raw";
+const SPECTROMETER: &str = "/spectrometer";
 const UAV_FIX: &str = "/uav/fix";
 const TF: &str = "/tf";
 const DETECTIONS: &str = "/fire/detections";
@@ -144,6 +146,9 @@ impl Tape {
                 self.protobuf::<CameraCalibration>(topic, &message, arrived, pair.at)?;
             }
         }
+        for spectrum in &pair.value.spectra {
+            self.spectrum(spectrum, arrived)?;
+        }
         self.image(LEFT_IMAGE, Eye::Left, &pair.value.left, arrived)?;
         match &pair.value.right {
             Some(right) => self.image(RIGHT_IMAGE, Eye::Right, right, arrived),
@@ -257,6 +262,29 @@ impl Tape {
             path: self.path.clone(),
             source,
         })
+    }
+
+    /// A reading as it came, before the pair that it belongs to.
+    fn spectrum(&mut self, spectrum: &Spectrum, arrived: ServiceTime) -> Result<(), RecordError> {
+        let value = serde_json::json!({
+            "wavelengths_nm": spectrum.wavelengths_nm(),
+            "intensity": spectrum.intensity(),
+        });
+        let bytes =
+            serde_json::to_vec(&value).map_err(|error| self.unencodable(SPECTROMETER, &error))?;
+        let schema = (
+            "emberfix.Spectrum",
+            "jsonschema",
+            schemas::SPECTRUM.as_bytes(),
+        );
+        let label = Label {
+            topic: SPECTROMETER,
+            encoding: "json",
+            schema: Some(schema),
+            logged: arrived,
+            published: spectrum.at,
+        };
+        self.put(&label, &bytes)
     }
 
     fn image(

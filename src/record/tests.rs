@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::alarm::{Alarm, AlarmClass, AlarmProperties, FireState, Method};
+use crate::assess::spectrum::Spectrum;
 use crate::detect::{BoxPx, Detection, DetectionClass};
 use crate::ingest::testing::{at, pair, rig, workspace};
 use crate::ingest::{McapStream, Recorded, Recording, StereoPair, StreamEvent};
@@ -39,6 +40,7 @@ fn alarm(ms: i64) -> Alarm {
             size_m: None,
             trend: Some(0.01),
             advice: None,
+            burning: Default::default(),
             degraded: vec!["one_eye".to_owned()],
         },
     }
@@ -88,12 +90,16 @@ fn record(path: &Path, options: &RecordOptions) {
     tape.finish().unwrap();
 }
 
-/// Every fourth pair has lost its right eye.
+/// Every fourth pair has lost its right eye, and before every fourth the spectrometer has spoken.
 fn recorded_pair(n: i64) -> Stamped<StereoPair> {
     let mut pair = pair(n);
     if n % 4 == 3 {
         pair.value.right = None;
         pair.value.skew = emberfix_frames::SignedDuration::ZERO;
+    }
+    if n % 4 == 1 {
+        let (nm, light) = (vec![588.0, 589.3, 591.0], vec![1.0, 7.5, 1.25]);
+        pair.value.spectra = vec![Spectrum::new(pair.at, nm, light).unwrap()];
     }
     pair
 }

@@ -18,6 +18,8 @@ mod core;
 mod courier;
 mod telemetry;
 
+pub(crate) use telemetry::WANTED;
+
 use crate::deliver::mavlink::MavlinkDelivery;
 use crate::deliver::{Outbox, OutboxError};
 use crate::ground::Ping;

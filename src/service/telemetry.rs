@@ -18,7 +18,7 @@ use std::sync::mpsc::SyncSender;
 use std::time::Duration;
 
 /// What we ask the autopilot for: message id, rate in Hz.
-const WANTED: [(u32, f64); 5] = [
+pub(crate) const WANTED: [(u32, f64); 5] = [
     (31, 50.0), // ATTITUDE_QUATERNION
     (33, 50.0), // GLOBAL_POSITION_INT
     (24, 5.0),  // GPS_RAW_INT

@@ -48,6 +48,7 @@ pub fn pair(sequence: u64, at: ServiceTime) -> Stamped<StereoPair> {
         at,
     };
     let value = StereoPair {
+        spectra: Vec::new(),
         sequence,
         arrived: at + SignedDuration::from_millis(20),
         left: image(eye(sequence, 0)),

@@ -117,23 +117,25 @@ pub(super) fn import(path: &Path, text: &str) -> Result<Imported, ImportError> {
 
 fn entry<'a>(path: &Path, eeprom: &'a Eeprom, socket: i64) -> Result<&'a Entry, ImportError> {
     let found = eeprom.camera_data.iter().find(|(at, _)| *at == socket);
-    found.map(|(_, entry)| entry).ok_or_else(|| ImportError::Missing {
-        path: path.to_owned(),
-        key: format!("cameraData of socket {socket}"),
-        remedy: "the device's stereo pair must be calibrated",
-    })
+    found
+        .map(|(_, entry)| entry)
+        .ok_or_else(|| ImportError::Missing {
+            path: path.to_owned(),
+            key: format!("cameraData of socket {socket}"),
+            remedy: "the device's stereo pair must be calibrated",
+        })
 }
 
-fn eye(
-    path: &Path,
-    eeprom: &Eeprom,
-    socket: i64,
-) -> Result<(Camera, Option<String>), ImportError> {
+fn eye(path: &Path, eeprom: &Eeprom, socket: i64) -> Result<(Camera, Option<String>), ImportError> {
     let entry = entry(path, eeprom, socket)?;
     let key = format!("cameraData[{socket}]");
     let flat: Vec<f64> = entry.intrinsic_matrix.iter().flatten().copied().collect();
     let k: [f64; 9] = numbers(path, &format!("{key}.intrinsicMatrix"), &flat, "9")?;
-    super::finite(path, &format!("{key}.distortionCoeff"), &entry.distortion_coeff)?;
+    super::finite(
+        path,
+        &format!("{key}.distortionCoeff"),
+        &entry.distortion_coeff,
+    )?;
     let terms = &entry.distortion_coeff;
     let lens = match entry.camera_type {
         0 if terms.iter().skip(12).all(|tilt| *tilt == 0.0) => Lens::Brown(terms.clone()),
@@ -161,12 +163,7 @@ fn eye(
 }
 
 /// The way from the left camera to the right one, along the chain in either direction.
-fn between(
-    path: &Path,
-    eeprom: &Eeprom,
-    left: i64,
-    right: i64,
-) -> Result<Step, ImportError> {
+fn between(path: &Path, eeprom: &Eeprom, left: i64, right: i64) -> Result<Step, ImportError> {
     if let Some(step) = follow(path, eeprom, left, right)? {
         return Ok(step);
     }
@@ -200,12 +197,21 @@ fn follow(path: &Path, eeprom: &Eeprom, from: i64, to: i64) -> Result<Option<Ste
 
 fn step(path: &Path, socket: i64, extrinsics: &Extrinsics) -> Result<Step, ImportError> {
     let key = format!("cameraData[{socket}].extrinsics");
-    let flat: Vec<f64> = extrinsics.rotation_matrix.iter().flatten().copied().collect();
+    let flat: Vec<f64> = extrinsics
+        .rotation_matrix
+        .iter()
+        .flatten()
+        .copied()
+        .collect();
     let flat: [f64; 9] = numbers(path, &format!("{key}.rotationMatrix"), &flat, "9")?;
     let Translation { x, y, z } = extrinsics.translation;
     super::finite(path, &format!("{key}.translation"), &[x, y, z])?;
     Ok(Step {
-        turn: rotation(path, &format!("{key}.rotationMatrix"), &Matrix3::from_row_slice(&flat))?,
+        turn: rotation(
+            path,
+            &format!("{key}.rotationMatrix"),
+            &Matrix3::from_row_slice(&flat),
+        )?,
         move_m: Vector3::new(x, y, z) * M_PER_CM,
     })
 }

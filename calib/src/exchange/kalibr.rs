@@ -2,9 +2,7 @@
 //! one, `T_cam_imu` the IMU to the camera, `timeshift_cam_imu` is IMU time minus camera time.
 
 use super::lens::{Lens, Pinhole, camera};
-use super::{
-    Answers, ImportError, Imported, ImuAxes, numbers, right_of_left, rotation, stem,
-};
+use super::{Answers, ImportError, Imported, ImuAxes, numbers, right_of_left, rotation, stem};
 use crate::{Camera, mount_angles};
 use emberfix_frames::{Matrix3, MountAngles, Vector3};
 use serde::Deserialize;
@@ -48,7 +46,10 @@ pub(super) fn import(path: &Path, text: &str, answers: Answers) -> Result<Import
     let first = chain.cam0.ok_or_else(|| missing("cam0", pair))?;
     let second = chain.cam1.ok_or_else(|| missing("cam1", pair))?;
     let between = second.from_previous.as_ref().ok_or_else(|| {
-        missing("cam1.T_cn_cnm1", "calibrate both cameras together, so that Kalibr writes it")
+        missing(
+            "cam1.T_cn_cnm1",
+            "calibrate both cameras together, so that Kalibr writes it",
+        )
     })?;
     let (right_from_left, translation_m) = transform(path, "cam1.T_cn_cnm1", between)?;
     right_of_left(path, &translation_m)?;
@@ -73,7 +74,11 @@ fn eye(path: &Path, key: &str, entry: &Entry) -> Result<(Camera, Option<String>)
         model: model.to_owned(),
         known,
     };
-    if let Some(model) = entry.camera_model.as_deref().filter(|model| *model != "pinhole") {
+    if let Some(model) = entry
+        .camera_model
+        .as_deref()
+        .filter(|model| *model != "pinhole")
+    {
         return Err(unknown(model, "pinhole"));
     }
     let [fx, fy, cx, cy] = numbers(path, &format!("{key}.intrinsics"), &entry.intrinsics, "4")?;

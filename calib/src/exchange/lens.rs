@@ -54,7 +54,8 @@ pub(super) fn camera(
             missed_px,
         });
     }
-    let note = format!("{key}: {model} was brought to five terms, missed by {missed_px:.3} px at most");
+    let note =
+        format!("{key}: {model} was brought to five terms, missed by {missed_px:.3} px at most");
     Ok((camera, Some(note)))
 }
 
@@ -105,7 +106,10 @@ fn rays(camera: &Camera, lens: &Lens) -> Vec<(f64, f64)> {
     const BEYOND: f64 = 3.0;
     let (width, height) = camera.image_size_px;
     let reach = |pixels: u32, focal: f64| BEYOND * f64::from(pixels) / (2.0 * focal);
-    let (reach_x, reach_y) = (reach(width, camera.focal_px.0), reach(height, camera.focal_px.1));
+    let (reach_x, reach_y) = (
+        reach(width, camera.focal_px.0),
+        reach(height, camera.focal_px.1),
+    );
     let inside = |value: f64, pixels: u32| (-0.5..f64::from(pixels) - 0.5).contains(&value);
     let share = |step: i32| f64::from(step) / f64::from(STEPS);
     (-STEPS..=STEPS)
@@ -171,15 +175,19 @@ mod tests {
             focal_px: (300.0, 300.0),
             ..PINHOLE
         };
-        let error = super::camera(path, "left", &wide, &Lens::Equidistant([0.01, 0.0, 0.0, 0.0]));
+        let error = super::camera(
+            path,
+            "left",
+            &wide,
+            &Lens::Equidistant([0.01, 0.0, 0.0, 0.0]),
+        );
         assert!(error.unwrap_err().to_string().contains("missed by"));
     }
 
     #[test]
     fn five_terms_are_taken_as_they_are() {
         let terms = vec![0.1, 0.2, 0.3, 0.4, 0.5, 0.0, 0.0];
-        let (camera, note) =
-            camera(Path::new("x"), "left", &PINHOLE, &Lens::Brown(terms)).unwrap();
+        let (camera, note) = camera(Path::new("x"), "left", &PINHOLE, &Lens::Brown(terms)).unwrap();
         assert_eq!(camera.distortion, [0.1, 0.2, 0.3, 0.4, 0.5]);
         assert_eq!(note, None);
     }

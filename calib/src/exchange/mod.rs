@@ -304,8 +304,10 @@ fn format(path: &Path, text: &str) -> Result<Format, ImportError> {
 }
 
 fn stem(path: &Path) -> String {
-    path.file_stem()
-        .map_or_else(|| "rig".to_owned(), |stem| stem.to_string_lossy().into_owned())
+    path.file_stem().map_or_else(
+        || "rig".to_owned(),
+        |stem| stem.to_string_lossy().into_owned(),
+    )
 }
 
 /// How far from orthonormal a printed rotation may be: five decimals are, by 1e-5.

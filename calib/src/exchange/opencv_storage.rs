@@ -2,7 +2,9 @@
 //! Neither the unit of T nor, often, the image size stands in it: both are asked for.
 
 use super::lens::{Lens, Pinhole, camera};
-use super::{Answers, ImportError, Imported, LengthUnit, finite, numbers, right_of_left, rotation, stem};
+use super::{
+    Answers, ImportError, Imported, LengthUnit, finite, numbers, right_of_left, rotation, stem,
+};
 use crate::{Eye, Rig};
 use emberfix_frames::{Matrix3, Vector3};
 use opencv::core::{
@@ -10,17 +12,38 @@ use opencv::core::{
     FileStorage_MEMORY, FileStorage_READ, FileStorage_WRITE, Mat,
 };
 use opencv::prelude::{
-    FileNodeTraitConst, FileStorageTrait, FileStorageTraitConst, MatTraitConst,
-    MatTraitConstManual,
+    FileNodeTraitConst, FileStorageTrait, FileStorageTraitConst, MatTraitConst, MatTraitConstManual,
 };
 use std::path::{Path, PathBuf};
 
 const FORMAT: &str = "OpenCV FileStorage";
 
-const LEFT_K: &[&str] = &["M1", "K1", "cameraMatrix1", "camera_matrix_left", "left_K", "CM1", "K_left"];
-const RIGHT_K: &[&str] = &["M2", "K2", "cameraMatrix2", "camera_matrix_right", "right_K", "CM2", "K_right"];
+const LEFT_K: &[&str] = &[
+    "M1",
+    "K1",
+    "cameraMatrix1",
+    "camera_matrix_left",
+    "left_K",
+    "CM1",
+    "K_left",
+];
+const RIGHT_K: &[&str] = &[
+    "M2",
+    "K2",
+    "cameraMatrix2",
+    "camera_matrix_right",
+    "right_K",
+    "CM2",
+    "K_right",
+];
 const LEFT_D: &[&str] = &["D1", "distCoeffs1", "dist_coeffs_left", "left_D", "D_left"];
-const RIGHT_D: &[&str] = &["D2", "distCoeffs2", "dist_coeffs_right", "right_D", "D_right"];
+const RIGHT_D: &[&str] = &[
+    "D2",
+    "distCoeffs2",
+    "dist_coeffs_right",
+    "right_D",
+    "D_right",
+];
 const WIDTH: &[&str] = &["image_width", "image_Width", "width", "imageWidth"];
 const HEIGHT: &[&str] = &["image_height", "image_Height", "height", "imageHeight"];
 
@@ -69,9 +92,10 @@ fn open(path: &Path) -> Result<FileStorage, ImportError> {
     let syntax = |error: opencv::Error| ImportError::Syntax {
         path: path.to_owned(),
         format: FORMAT,
-        problem: error.message.replace('\n', " "),
+        problem: what_it_said(&error),
     };
-    let store = FileStorage::new(&text, FileStorage_READ | FileStorage_MEMORY, "").map_err(syntax)?;
+    let store =
+        FileStorage::new(&text, FileStorage_READ | FileStorage_MEMORY, "").map_err(syntax)?;
     if store.is_opened().map_err(syntax)? {
         return Ok(store);
     }
@@ -80,6 +104,16 @@ fn open(path: &Path) -> Result<FileStorage, ImportError> {
         format: FORMAT,
         problem: "it holds nothing".to_owned(),
     })
+}
+
+/// The end of OpenCV's message: before it stand its version, its source file and its function.
+fn what_it_said(error: &opencv::Error) -> String {
+    let message = error.message.replace('\n', " ");
+    let said = message.rsplit("in function").next().unwrap_or_default();
+    format!(
+        "line {}",
+        said.trim_matches([' ', '\'', '(']).replacen("):", ":", 1)
+    )
 }
 
 impl Stores<'_> {
@@ -115,11 +149,16 @@ impl Stores<'_> {
     }
 
     fn matrix(&self, names: &[&str]) -> Result<Vec<f64>, ImportError> {
-        let mat = self.needed(names)?.mat().map_err(|error| self.failed(error))?;
+        let mat = self
+            .needed(names)?
+            .mat()
+            .map_err(|error| self.failed(error))?;
         let mut doubles = Mat::default();
         mat.convert_to(&mut doubles, CV_64F, 1.0, 0.0)
             .map_err(|error| self.failed(error))?;
-        let values = doubles.data_typed::<f64>().map_err(|error| self.failed(error))?;
+        let values = doubles
+            .data_typed::<f64>()
+            .map_err(|error| self.failed(error))?;
         Ok(values.to_vec())
     }
 
@@ -199,11 +238,26 @@ fn write(rig: &Rig, xml: bool) -> opencv::Result<String> {
         put(&mut store, k, 3, &matrix)?;
         put(&mut store, d, 1, &camera.distortion)?;
     }
-    put(&mut store, "R", 3, rig.right_from_left().transpose().as_slice())?;
-    put(&mut store, "T", 3, rig.right_from_left_translation_m().as_slice())?;
+    put(
+        &mut store,
+        "R",
+        3,
+        rig.right_from_left().transpose().as_slice(),
+    )?;
+    put(
+        &mut store,
+        "T",
+        3,
+        rig.right_from_left_translation_m().as_slice(),
+    )?;
     let rectification = rig.rectification();
     for (eye, r, p) in [(Eye::Left, "R1", "P1"), (Eye::Right, "R2", "P2")] {
-        put(&mut store, r, 3, rectification.rectified_from_raw(eye).transpose().as_slice())?;
+        put(
+            &mut store,
+            r,
+            3,
+            rectification.rectified_from_raw(eye).transpose().as_slice(),
+        )?;
         let k = rectification.projection(eye);
         let along = match eye {
             Eye::Left => 0.0,

@@ -81,8 +81,18 @@ fn side(path: &Path) -> Result<Side, ImportError> {
         problem: super::one_line(&error),
     })?;
     let k: [f64; 9] = numbers(path, "camera_matrix", &info.camera_matrix.data, "9")?;
-    let r: [f64; 9] = numbers(path, "rectification_matrix", &info.rectification_matrix.data, "9")?;
-    let p: [f64; 12] = numbers(path, "projection_matrix", &info.projection_matrix.data, "12")?;
+    let r: [f64; 9] = numbers(
+        path,
+        "rectification_matrix",
+        &info.rectification_matrix.data,
+        "9",
+    )?;
+    let p: [f64; 12] = numbers(
+        path,
+        "projection_matrix",
+        &info.projection_matrix.data,
+        "12",
+    )?;
     let pinhole = Pinhole {
         size: (info.image_width, info.image_height),
         focal_px: (k[0], k[4]),
@@ -107,9 +117,7 @@ fn lens(path: &Path, info: &Info) -> Result<Lens, ImportError> {
     finite(path, key, terms)?;
     match info.distortion_model.as_deref() {
         Some("plumb_bob" | "rational_polynomial") | None => Ok(Lens::Brown(terms.clone())),
-        Some("equidistant" | "fisheye") => {
-            Ok(Lens::Equidistant(numbers(path, key, terms, "4")?))
-        }
+        Some("equidistant" | "fisheye") => Ok(Lens::Equidistant(numbers(path, key, terms, "4")?)),
         Some(other) => Err(ImportError::LensModel {
             path: path.to_owned(),
             key: "distortion_model".to_owned(),
@@ -143,7 +151,12 @@ fn info(rig: &Rig, eye: Eye) -> String {
         camera.image_size_px.0,
         camera.image_size_px.1,
         serde_json::Value::from(format!("{}/{name}", rig.name())),
-        matrix("camera_matrix", 3, 3, &[fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]),
+        matrix(
+            "camera_matrix",
+            3,
+            3,
+            &[fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+        ),
         matrix("distortion_coefficients", 1, 5, &camera.distortion),
         matrix("rectification_matrix", 3, 3, &r),
         matrix(
@@ -151,9 +164,18 @@ fn info(rig: &Rig, eye: Eye) -> String {
             3,
             4,
             &[
-                p(0, 0), 0.0, p(0, 2), along, //
-                0.0, p(1, 1), p(1, 2), 0.0, //
-                0.0, 0.0, 1.0, 0.0,
+                p(0, 0),
+                0.0,
+                p(0, 2),
+                along, //
+                0.0,
+                p(1, 1),
+                p(1, 2),
+                0.0, //
+                0.0,
+                0.0,
+                1.0,
+                0.0,
             ]
         ),
     )

@@ -1,15 +1,12 @@
 //! Corners in one image, numbered the same way in every image.
 
-use super::{Board, BoardKind, Corner, View, charuco};
+use super::{Board, Corner, View};
 use crate::RawPixel;
 use emberfix_frames::Vector2;
-use opencv::core::{
-    Mat, MatTraitConst, Point2f, Size, TermCriteria, Vector,
-};
+use opencv::core::{Mat, MatTraitConst, Point2f, Size, TermCriteria, Vector};
 use opencv::{Result, calib3d, imgcodecs, imgproc};
 
-/// The board's corners in a grey image (8 bit, one channel): all of a chessboard, any of a ChArUco
-/// board; `None` where it is not seen.
+/// All of the board's corners in a grey image (8 bit, one channel); `None` where it is not seen whole.
 ///
 /// A dim or flat image (a near-infrared eye's, say) gets a second look with its contrast raised.
 ///
@@ -20,26 +17,15 @@ pub fn find_corners(image: &Mat, board: &Board) -> Result<Option<Vec<Corner>>> {
         return Ok(Some(corners));
     }
     let mut raised = Mat::default();
-    imgproc::create_clahe(4.0, Size::new(8, 8))
-        .and_then(|mut clahe| {
-            use opencv::prelude::CLAHETrait;
-            clahe.apply(image, &mut raised)
-        })?;
+    imgproc::create_clahe(4.0, Size::new(8, 8)).and_then(|mut clahe| {
+        use opencv::prelude::CLAHETrait;
+        clahe.apply(image, &mut raised)
+    })?;
     look(&raised, image, board)
 }
 
 /// Finds in one version of the image, refines in the untouched one.
 fn look(contrasted: &Mat, image: &Mat, board: &Board) -> Result<Option<Vec<Corner>>> {
-    match board.kind {
-        BoardKind::Chessboard => chessboard(contrasted, image, board),
-        BoardKind::Charuco {
-            dictionary,
-            marker_share,
-        } => charuco::find(contrasted, image, board, dictionary, marker_share),
-    }
-}
-
-fn chessboard(contrasted: &Mat, image: &Mat, board: &Board) -> Result<Option<Vec<Corner>>> {
     let mut points = Vector::<Point2f>::new();
     let flags = calib3d::CALIB_CB_ADAPTIVE_THRESH
         + calib3d::CALIB_CB_NORMALIZE_IMAGE
@@ -68,7 +54,7 @@ fn raw(point: Point2f) -> RawPixel {
 /// The least way from one corner to the next in its row or column.
 fn spacing_px(points: &Vector<Point2f>, columns: usize) -> f64 {
     let points: Vec<Point2f> = points.iter().collect();
-    let way = |a: Point2f, b: Point2f| f64::from((a - b).norm());
+    let way = |a: Point2f, b: Point2f| (a - b).norm();
     let in_rows = points
         .chunks(columns)
         .flat_map(|row| row.windows(2).map(|pair| way(pair[0], pair[1])));
@@ -83,7 +69,7 @@ fn spacing_px(points: &Vector<Point2f>, columns: usize) -> f64 {
 const WINDOW_SHARE: f64 = 0.4;
 
 /// Moves the corners to where the image's gradients point, in a window that fits the squares.
-pub(super) fn refine(image: &Mat, points: &mut Vector<Point2f>, spacing_px: f64) -> Result<()> {
+fn refine(image: &Mat, points: &mut Vector<Point2f>, spacing_px: f64) -> Result<()> {
     let half = (spacing_px * WINDOW_SHARE).clamp(2.0, 11.0) as i32;
     imgproc::corner_sub_pix(
         image,

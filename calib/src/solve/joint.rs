@@ -6,7 +6,7 @@ use super::project::{INTRINSICS, camera, intrinsics, project};
 use super::{Board, Corner, Residual, SolveError, StereoSolution, View, ViewResiduals};
 use crate::Camera;
 use emberfix_frames::{Matrix3, UnitQuaternion, Vector3};
-use nalgebra::{Matrix6, SMatrix, SVector, Vector2, Vector6};
+use nalgebra::{SMatrix, SVector, Vector2, Vector6};
 
 /// Parameters that all views share: nine of each camera, rotation, translation.
 pub const GLOBALS: usize = 2 * INTRINSICS + 6;
@@ -14,7 +14,11 @@ pub const GLOBALS: usize = 2 * INTRINSICS + 6;
 pub type GlobalMatrix = SMatrix<f64, GLOBALS, GLOBALS>;
 /// A vector of the shared parameters.
 pub type GlobalVector = SVector<f64, GLOBALS>;
-type Cross = SMatrix<f64, GLOBALS, 6>;
+/// Parameters of one view: its board's pose.
+const OWN: usize = 6;
+type Cross = SMatrix<f64, GLOBALS, OWN>;
+type OwnMatrix = SMatrix<f64, OWN, OWN>;
+type OwnVector = SVector<f64, OWN>;
 
 const ROTATION: usize = 2 * INTRINSICS;
 const TRANSLATION: usize = ROTATION + 3;
@@ -132,61 +136,102 @@ fn turned(rotation: &Matrix3<f64>, by_rad: &Vector3<f64>) -> Matrix3<f64> {
     turn.to_rotation_matrix().into_inner() * rotation
 }
 
+/// The normal equations of one eye in one view, over the parameters that move it.
+struct EyeSum<const N: usize> {
+    shared: SMatrix<f64, N, N>,
+    cross: SMatrix<f64, N, OWN>,
+    own: OwnMatrix,
+    shared_gradient: SVector<f64, N>,
+    own_gradient: OwnVector,
+    cost: f64,
+}
+
+impl<const N: usize> EyeSum<N> {
+    fn of(corners: &[Corner], weight: f64, row: impl Fn(&Corner) -> Row<N>) -> Self {
+        let mut sum = Self {
+            shared: SMatrix::zeros(),
+            cross: SMatrix::zeros(),
+            own: SMatrix::zeros(),
+            shared_gradient: SVector::zeros(),
+            own_gradient: SVector::zeros(),
+            cost: 0.0,
+        };
+        for row in corners.iter().map(row) {
+            let shared_t = row.by_shared.transpose() * weight;
+            let own_t = row.by_own.transpose() * weight;
+            sum.shared += shared_t * row.by_shared;
+            sum.cross += shared_t * row.by_own;
+            sum.own += own_t * row.by_own;
+            sum.shared_gradient += shared_t * row.off;
+            sum.own_gradient += own_t * row.off;
+            sum.cost += weight * row.off.norm_squared();
+        }
+        sum
+    }
+}
+
 /// The normal equations of one view.
 struct ViewEquations {
     shared: GlobalMatrix,
     cross: Cross,
-    board: Matrix6<f64>,
+    own: OwnMatrix,
     shared_gradient: GlobalVector,
-    board_gradient: Vector6<f64>,
+    own_gradient: OwnVector,
     cost: f64,
 }
 
-/// One over the corner sigmas of both eyes.
+/// How far corners stray, one sigma per axis, pixels.
 #[derive(Debug, Clone, Copy)]
-struct Weights {
-    left: f64,
-    right: f64,
+struct Noise {
+    left_px: f64,
+    right_px: f64,
 }
 
-struct Row {
-    off: Vector2<f64>,
-    by_shared: SMatrix<f64, 2, GLOBALS>,
-    by_board: SMatrix<f64, 2, 6>,
-}
-
-fn left_row(state: &State, pose: &BoardPose, board: &Board, corner: &Corner) -> Row {
-    let on_board = board.point_m(corner.id);
-    let seen = project(&state.left, &pose.point_m(&on_board));
-    let mut by_shared = SMatrix::<f64, 2, GLOBALS>::zeros();
-    by_shared
-        .fixed_view_mut::<2, INTRINSICS>(0, 0)
-        .copy_from(&seen.by_intrinsics);
-    Row {
-        off: found(corner) - seen.pixel,
-        by_shared,
-        by_board: seen.by_point * point_by_pose(pose, &on_board),
+impl Noise {
+    fn weights(self) -> [f64; 2] {
+        [self.left_px.powi(-2), self.right_px.powi(-2)]
     }
 }
 
-fn right_row(state: &State, pose: &BoardPose, board: &Board, corner: &Corner) -> Row {
+/// One corner: how far off, and how that changes with `N` shared parameters that stand in a row and with
+/// the board's pose.
+struct Row<const N: usize> {
+    off: Vector2<f64>,
+    by_shared: SMatrix<f64, 2, N>,
+    by_own: SMatrix<f64, 2, OWN>,
+}
+
+/// The left eye moves with its own camera and with the board.
+type LeftRow = Row<INTRINSICS>;
+/// The right eye moves with its own camera, the pair, and the board.
+type RightRow = Row<RIGHT>;
+const RIGHT: usize = INTRINSICS + 6;
+
+fn left_row(state: &State, pose: &BoardPose, board: &Board, corner: &Corner) -> LeftRow {
+    let on_board = board.point_m(corner.id);
+    let seen = project(&state.left, &pose.point_m(&on_board));
+    Row {
+        off: found(corner) - seen.pixel,
+        by_shared: seen.by_intrinsics,
+        by_own: seen.by_point * point_by_pose(pose, &on_board),
+    }
+}
+
+fn right_row(state: &State, pose: &BoardPose, board: &Board, corner: &Corner) -> RightRow {
     let on_board = board.point_m(corner.id);
     let turned = state.right_from_left * pose.point_m(&on_board);
     let seen = project(&state.right, &(turned + state.translation_m));
-    let mut by_shared = SMatrix::<f64, 2, GLOBALS>::zeros();
-    by_shared
-        .fixed_view_mut::<2, INTRINSICS>(0, INTRINSICS)
-        .copy_from(&seen.by_intrinsics);
-    by_shared
-        .fixed_view_mut::<2, 3>(0, ROTATION)
-        .copy_from(&(seen.by_point * -turned.cross_matrix()));
-    by_shared
-        .fixed_view_mut::<2, 3>(0, TRANSLATION)
-        .copy_from(&seen.by_point);
+    let mut by_shared = SMatrix::<f64, 2, RIGHT>::zeros();
+    let mut put = by_shared.fixed_view_mut::<2, INTRINSICS>(0, 0);
+    put.copy_from(&seen.by_intrinsics);
+    let mut put = by_shared.fixed_view_mut::<2, 3>(0, INTRINSICS);
+    put.copy_from(&(seen.by_point * -turned.cross_matrix()));
+    let mut put = by_shared.fixed_view_mut::<2, 3>(0, INTRINSICS + 3);
+    put.copy_from(&seen.by_point);
     Row {
         off: found(corner) - seen.pixel,
         by_shared,
-        by_board: seen.by_point * state.right_from_left * point_by_pose(pose, &on_board),
+        by_own: seen.by_point * state.right_from_left * point_by_pose(pose, &on_board),
     }
 }
 
@@ -207,49 +252,58 @@ fn point_by_pose(pose: &BoardPose, on_board: &Vector3<f64>) -> SMatrix<f64, 3, 6
 }
 
 impl ViewEquations {
-    fn new(state: &State, pose: &BoardPose, board: &Board, view: &View, weights: Weights) -> Self {
+    fn new(
+        state: &State,
+        pose: &BoardPose,
+        board: &Board,
+        view: &View,
+        [left_weight, right_weight]: [f64; 2],
+    ) -> Self {
+        let left = EyeSum::of(&view.left, left_weight, |corner| {
+            left_row(state, pose, board, corner)
+        });
+        let right = EyeSum::of(&view.right, right_weight, |corner| {
+            right_row(state, pose, board, corner)
+        });
         let mut sum = Self {
             shared: GlobalMatrix::zeros(),
             cross: Cross::zeros(),
-            board: Matrix6::zeros(),
+            own: OwnMatrix::zeros(),
             shared_gradient: GlobalVector::zeros(),
-            board_gradient: Vector6::zeros(),
+            own_gradient: OwnVector::zeros(),
             cost: 0.0,
         };
-        for corner in &view.left {
-            sum.add(&left_row(state, pose, board, corner), weights.left);
-        }
-        for corner in &view.right {
-            sum.add(&right_row(state, pose, board, corner), weights.right);
-        }
+        sum.add(&left, 0);
+        sum.add(&right, INTRINSICS);
         sum
     }
 
-    fn add(&mut self, row: &Row, weight: f64) {
-        let w = weight * weight;
-        let shared_t = row.by_shared.transpose() * w;
-        let board_t = row.by_board.transpose() * w;
-        self.shared += shared_t * row.by_shared;
-        self.cross += shared_t * row.by_board;
-        self.board += board_t * row.by_board;
-        self.shared_gradient += shared_t * row.off;
-        self.board_gradient += board_t * row.off;
-        self.cost += w * row.off.norm_squared();
+    /// Adds an eye whose shared parameters begin at `from`.
+    fn add<const N: usize>(&mut self, eye: &EyeSum<N>, from: usize) {
+        let mut shared = self.shared.fixed_view_mut::<N, N>(from, from);
+        shared += &eye.shared;
+        let mut cross = self.cross.fixed_view_mut::<N, OWN>(from, 0);
+        cross += &eye.cross;
+        let mut gradient = self.shared_gradient.fixed_rows_mut::<N>(from);
+        gradient += &eye.shared_gradient;
+        self.own += eye.own;
+        self.own_gradient += eye.own_gradient;
+        self.cost += eye.cost;
     }
 
-    /// The shared parameters' part once the board is eliminated.
+    /// The shared parameters' part once the view's own are eliminated.
     fn reduced(&self, damping: f64) -> Option<(GlobalMatrix, GlobalVector)> {
-        let inverse = damped(self.board, damping).cholesky()?.inverse();
+        let inverse = damped(self.own, damping).cholesky()?.inverse();
         let gain = self.cross * inverse;
         Some((
             damped(self.shared, damping) - gain * self.cross.transpose(),
-            self.shared_gradient - gain * self.board_gradient,
+            self.shared_gradient - gain * self.own_gradient,
         ))
     }
 
-    fn board_step(&self, shared_step: &GlobalVector, damping: f64) -> Option<Vector6<f64>> {
-        let right_side = self.board_gradient - self.cross.transpose() * shared_step;
-        Some(damped(self.board, damping).cholesky()?.solve(&right_side))
+    fn own_step(&self, shared_step: &GlobalVector, damping: f64) -> Option<OwnVector> {
+        let right_side = self.own_gradient - self.cross.transpose() * shared_step;
+        Some(damped(self.own, damping).cholesky()?.solve(&right_side))
     }
 }
 
@@ -261,16 +315,10 @@ fn damped<const N: usize>(matrix: SMatrix<f64, N, N>, damping: f64) -> SMatrix<f
     matrix
 }
 
-fn equations(
-    state: &State,
-    board: &Board,
-    views: &[View],
-    weights: Weights,
-) -> Vec<ViewEquations> {
-    let poses = state.boards.iter();
-    poses
-        .zip(views)
-        .map(|(pose, view)| ViewEquations::new(state, pose, board, view, weights))
+fn equations(state: &State, board: &Board, views: &[View], noise: Noise) -> Vec<ViewEquations> {
+    let views = views.iter().zip(&state.boards);
+    views
+        .map(|(view, pose)| ViewEquations::new(state, pose, board, view, noise.weights()))
         .collect()
 }
 
@@ -280,7 +328,7 @@ fn cost(equations: &[ViewEquations]) -> f64 {
 
 const GREATEST_ITERATIONS: usize = 100;
 /// Ends when the cost falls by less than this share.
-const COST_SHARE: f64 = 1e-12;
+const COST_SHARE: f64 = 1e-9;
 
 /// Solves from a start; the eyes are weighted by their own corner noise.
 pub(super) fn solve(
@@ -288,28 +336,25 @@ pub(super) fn solve(
     views: &[View],
     start: State,
 ) -> Result<StereoSolution, SolveError> {
-    let equal = Weights {
-        left: 1.0,
-        right: 1.0,
+    let equal = Noise {
+        left_px: 1.0,
+        right_px: 1.0,
     };
     let state = minimise(board, views, start, equal)?;
-    let sigmas = corner_sigmas(&residuals(&state, board, views));
-    let weights = Weights {
-        left: 1.0 / sigmas[0],
-        right: 1.0 / sigmas[1],
-    };
-    let state = minimise(board, views, state, weights)?;
-    finish(board, views, state, weights)
+    let [left_px, right_px] = corner_sigmas(&residuals(&state, board, views));
+    let noise = Noise { left_px, right_px };
+    let state = minimise(board, views, state, noise)?;
+    finish(board, views, state, noise)
 }
 
 fn minimise(
     board: &Board,
     views: &[View],
     start: State,
-    weights: Weights,
+    noise: Noise,
 ) -> Result<State, SolveError> {
     let mut state = start;
-    let mut current = equations(&state, board, views, weights);
+    let mut current = equations(&state, board, views, noise);
     let mut damping = 1e-4;
     for _ in 0..GREATEST_ITERATIONS {
         let Some(next) = step(&state, &current, damping) else {
@@ -319,7 +364,7 @@ fn minimise(
             }
             continue;
         };
-        let there = equations(&next, board, views, weights);
+        let there = equations(&next, board, views, noise);
         let (before, after) = (cost(&current), cost(&there));
         if after.is_nan() || after > before {
             damping *= 10.0;
@@ -348,14 +393,16 @@ fn step(state: &State, equations: &[ViewEquations], damping: f64) -> Option<Stat
     let shared = scaled_inverse(&matrix)? * gradient;
     let mut next = state.moved(&shared);
     for (pose, view) in next.boards.iter_mut().zip(equations) {
-        *pose = pose.moved(&view.board_step(&shared, damping)?);
+        *pose = pose.moved(&view.own_step(&shared, damping)?);
     }
     Some(next)
 }
 
 /// The inverse of a positive matrix whose parameters differ in scale by many orders.
 fn scaled_inverse(matrix: &GlobalMatrix) -> Option<GlobalMatrix> {
-    let scale = matrix.diagonal().map(|value| value.max(1e-300).sqrt().recip());
+    let scale = matrix
+        .diagonal()
+        .map(|value| value.max(1e-300).sqrt().recip());
     let diagonal = GlobalMatrix::from_diagonal(&scale);
     let inverse = (diagonal * matrix * diagonal).cholesky()?.inverse();
     Some(diagonal * inverse * diagonal)
@@ -365,22 +412,22 @@ fn finish(
     board: &Board,
     views: &[View],
     state: State,
-    weights: Weights,
+    noise: Noise,
 ) -> Result<StereoSolution, SolveError> {
-    let residuals = residuals(&state, board, views);
-    let equations = equations(&state, board, views, weights);
+    let equations = equations(&state, board, views, noise);
     let mut parts = Vec::with_capacity(equations.len());
     for view in &equations {
         parts.push(view.reduced(0.0).ok_or(SolveError::Undetermined)?);
     }
     let information: GlobalMatrix = parts.iter().map(|(matrix, _)| matrix).sum();
     let covariance = scaled_inverse(&information).ok_or(SolveError::Undetermined)?;
-    let widened_by = jackknife_factor(&information, &parts, &covariance);
+    let widening = jackknife_widening(&information, &parts, &covariance);
+    let stretch = GlobalMatrix::from_diagonal(&widening);
     Ok(StereoSolution {
-        corner_sigma_px: corner_sigmas(&residuals),
-        covariance: covariance * (widened_by * widened_by),
-        widened_by,
-        residuals,
+        corner_sigma_px: [noise.left_px, noise.right_px],
+        covariance: stretch * covariance * stretch,
+        widened_by: widening.max(),
+        residuals: residuals(&state, board, views),
         left: state.left,
         right: state.right,
         right_from_left: state.right_from_left,
@@ -389,42 +436,40 @@ fn finish(
     })
 }
 
-/// By how much the parameters move when one view is left out, over what independent corners would
-/// make them move: the root of the median ratio of variances, at least 1.
-fn jackknife_factor(
+/// For each parameter, how much further it moves when one view is left out than independent corners
+/// would move it, at least 1. Each has its own: what whole views disagree about (the pair, most of all)
+/// is not what corners disagree about.
+fn jackknife_widening(
     information: &GlobalMatrix,
     parts: &[(GlobalMatrix, GlobalVector)],
     covariance: &GlobalMatrix,
-) -> f64 {
+) -> GlobalVector {
     let count = parts.len() as f64;
     let mut moves = Vec::with_capacity(parts.len());
     for (part, gradient) in parts {
         match scaled_inverse(&(information - part)) {
             Some(inverse) => moves.push(inverse * -gradient),
             // A view without which nothing is determined: the jackknife can't be told.
-            None => return 1.0,
+            None => return GlobalVector::repeat(1.0),
         }
     }
     let mean: GlobalVector = moves.iter().sum::<GlobalVector>() / count;
-    let mut ratios: Vec<f64> = (0..GLOBALS)
-        .map(|index| {
-            let squares: f64 = moves.iter().map(|m| (m[index] - mean[index]).powi(2)).sum();
-            squares * (count - 1.0) / count / covariance[(index, index)]
-        })
-        .collect();
-    ratios.sort_by(f64::total_cmp);
-    ratios[GLOBALS / 2].max(1.0).sqrt()
+    GlobalVector::from_fn(|index, _| {
+        let squares: f64 = moves.iter().map(|m| (m[index] - mean[index]).powi(2)).sum();
+        let ratio = squares * (count - 1.0) / count / covariance[(index, index)];
+        ratio.max(1.0).sqrt()
+    })
 }
 
 /// One sigma of a corner along one axis, an eye each; the fitted parameters are counted, half an eye.
 fn corner_sigmas(residuals: &[ViewResiduals]) -> [f64; 2] {
-    let fitted = (GLOBALS + 6 * residuals.len()) as f64 / 2.0;
+    let fitted = (GLOBALS + OWN * residuals.len()) as f64 / 2.0;
     let sigma = |eye: fn(&ViewResiduals) -> &Vec<Residual>| {
-        let all = residuals.iter().flat_map(eye);
-        let (count, squares) = all.fold((0.0, 0.0), |(count, squares), residual| {
-            let (u, v) = residual.off_px;
-            (count + 2.0, squares + u * u + v * v)
-        });
+        let (mut count, mut squares) = (0.0, 0.0);
+        for Residual { off_px: (u, v), .. } in residuals.iter().flat_map(eye) {
+            count += 2.0;
+            squares += u * u + v * v;
+        }
         // Corners that fit perfectly have noise all the same: a thousandth of a pixel.
         (squares / f64::max(count - fitted, 1.0)).sqrt().max(1e-3)
     };
@@ -432,27 +477,26 @@ fn corner_sigmas(residuals: &[ViewResiduals]) -> [f64; 2] {
 }
 
 fn residuals(state: &State, board: &Board, views: &[View]) -> Vec<ViewResiduals> {
-    let poses = state.boards.iter();
-    poses
-        .zip(views)
-        .map(|(pose, view)| view_residuals(state, board, view, pose))
+    let views = views.iter().zip(&state.boards);
+    views
+        .map(|(view, pose)| view_residuals(state, board, view, pose))
         .collect()
 }
 
 fn view_residuals(state: &State, board: &Board, view: &View, pose: &BoardPose) -> ViewResiduals {
-    let residual = |corner: &Corner, row: Row| Residual {
+    let residual = |corner: &Corner, off: Vector2<f64>| Residual {
         at: corner.pixel,
-        off_px: (row.off.x, row.off.y),
+        off_px: (off.x, off.y),
     };
     let left = view.left.iter();
     let right = view.right.iter();
     ViewResiduals {
         name: view.name.clone(),
         left: left
-            .map(|corner| residual(corner, left_row(state, pose, board, corner)))
+            .map(|corner| residual(corner, left_row(state, pose, board, corner).off))
             .collect(),
         right: right
-            .map(|corner| residual(corner, right_row(state, pose, board, corner)))
+            .map(|corner| residual(corner, right_row(state, pose, board, corner).off))
             .collect(),
     }
 }
@@ -464,15 +508,12 @@ pub(super) fn held_out(
     view: &View,
     near: BoardPose,
 ) -> ViewResiduals {
-    let weights = Weights {
-        left: 1.0 / solution.corner_sigma_px[0],
-        right: 1.0 / solution.corner_sigma_px[1],
-    };
+    let weights = solution.corner_sigma_px.map(|sigma| sigma.powi(-2));
     let state = State::from_solution(solution, Vec::new());
     let mut pose = near;
-    for _ in 0..20 {
+    for _ in 0..10 {
         let here = ViewEquations::new(&state, &pose, board, view, weights);
-        let Some(step) = here.board_step(&GlobalVector::zeros(), 0.0) else {
+        let Some(step) = here.own_step(&GlobalVector::zeros(), 0.0) else {
             break;
         };
         pose = pose.moved(&step);

@@ -7,13 +7,11 @@
 //!
 //! **Assumptions.** A flat board; corner errors independent of each other, with one sigma an eye,
 //! which the residuals tell. Where whole views disagree by more than that (a bent board, eyes out of
-//! step), a jackknife over views says so and [`StereoSolution::covariance`] is widened by its factor.
-//! **Known limits.** Every view needs the board in both eyes.
+//! step), a jackknife over views widens [`StereoSolution::covariance`], each parameter by its own factor.
+//! **Known limits.** Every view needs the whole chessboard in both eyes; no ChArUco.
 
 mod board;
 mod calibration;
-mod charuco;
-mod dictionary;
 mod find;
 mod joint;
 mod predict;
@@ -21,7 +19,7 @@ mod project;
 mod start;
 mod trust;
 
-pub use board::{Board, BoardError, BoardKind};
+pub use board::{Board, BoardError};
 pub use calibration::{
     COVERAGE_CELLS, Calibration, Demands, TOLD_DEPTHS_M, calibrate, cell, epipolar_rms_px,
     rectification,
@@ -110,7 +108,7 @@ pub struct StereoSolution {
     pub covariance: GlobalMatrix,
     /// One sigma of a corner along one axis, pixels: left eye, right eye.
     pub corner_sigma_px: [f64; 2],
-    /// By how much sigmas were widened because whole views disagree; 1 when they don't.
+    /// The most by which a parameter's sigma was widened because whole views disagree; 1 when they don't.
     pub widened_by: f64,
     /// What is left of every view.
     pub residuals: Vec<ViewResiduals>,

@@ -80,7 +80,10 @@ fn inverse_depth_gradients(
         let mut step = GlobalVector::zeros();
         step[index] = size;
         let (plus, minus) = (here.moved(&step), here.moved(&-step));
-        let (plus, minus) = (inverse_depths(&plus, &probes)?, inverse_depths(&minus, &probes)?);
+        let (plus, minus) = (
+            inverse_depths(&plus, &probes)?,
+            inverse_depths(&minus, &probes)?,
+        );
         for (depth, probes) in gradients.iter_mut().enumerate() {
             for (probe, gradient) in probes.iter_mut().enumerate() {
                 gradient[index] = (plus[depth][probe] - minus[depth][probe]) / (2.0 * size);

@@ -32,8 +32,7 @@ pub(super) fn project(camera: &Camera, point: &Vector3<f64>) -> Projection {
         fy * across,
         fy * (radial + 2.0 * y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x),
     );
-    let plane_by_point =
-        SMatrix::<f64, 2, 3>::new(1.0, 0.0, -x, 0.0, 1.0, -y) * (1.0 / point.z);
+    let plane_by_point = SMatrix::<f64, 2, 3>::new(1.0, 0.0, -x, 0.0, 1.0, -y) * (1.0 / point.z);
     #[rustfmt::skip]
     let by_intrinsics = SMatrix::<f64, 2, INTRINSICS>::from_row_slice(&[
         xd, 0.0, 1.0, 0.0, fx * x * r2, fx * x * r4, fx * 2.0 * x * y, fx * (r2 + 2.0 * x * x), fx * x * r6,
@@ -70,13 +69,18 @@ mod tests {
 
     #[test]
     fn derivatives_are_those_of_finite_differences() {
-        let values = [880.0, 870.0, 643.0, 357.0, -0.085, 0.062, 0.004, -0.003, -0.012];
+        let values = [
+            880.0, 870.0, 643.0, 357.0, -0.085, 0.062, 0.004, -0.003, -0.012,
+        ];
         let size = (1280, 720);
         let point = Vector3::new(0.4, -0.25, 0.9);
         let here = project(&camera(size, values), &point);
         let close = |found: f64, expected: f64| {
             // Central differences with steps of 1e-6 are good to about 1e-6 of the value.
-            assert!((found - expected).abs() < 1e-4 * (1.0 + expected.abs()), "{found} {expected}");
+            assert!(
+                (found - expected).abs() < 1e-4 * (1.0 + expected.abs()),
+                "{found} {expected}"
+            );
         };
         for index in 0..INTRINSICS {
             let moved = |step: f64| {

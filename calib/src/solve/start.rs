@@ -45,7 +45,11 @@ fn eye<'a>(
                 .collect(),
         );
         let pixels = corners.iter().map(|corner| corner.pixel);
-        image_points.push(pixels.map(|p| Point2f::new(p.u as f32, p.v as f32)).collect());
+        image_points.push(
+            pixels
+                .map(|p| Point2f::new(p.u as f32, p.v as f32))
+                .collect(),
+        );
     }
     let (mut matrix, mut distortion) = (Mat::default(), Mat::default());
     let mut rotations = Vector::<Mat>::new();
@@ -110,7 +114,12 @@ fn pair(left: &[BoardPose], right: &[BoardPose]) -> (Matrix3<f64>, Vector3<f64>)
     let away = |a: &(Matrix3<f64>, Vector3<f64>), b: &(Matrix3<f64>, Vector3<f64>)| {
         (a.0 - b.0).norm() + (a.1 - b.1).norm()
     };
-    let total = |candidate| relative.iter().map(|other| away(candidate, other)).sum::<f64>();
+    let total = |candidate| {
+        relative
+            .iter()
+            .map(|other| away(candidate, other))
+            .sum::<f64>()
+    };
     relative
         .iter()
         .min_by(|a, b| total(a).total_cmp(&total(b)))

@@ -58,7 +58,11 @@ pub fn drop_worst(
 }
 
 fn worst_view(solution: &StereoSolution) -> Option<(usize, Dropped)> {
-    let errors: Vec<f64> = solution.residuals.iter().map(ViewResiduals::rms_px).collect();
+    let errors: Vec<f64> = solution
+        .residuals
+        .iter()
+        .map(ViewResiduals::rms_px)
+        .collect();
     let limit_px = (OUTLIER_RATIO * median(&errors)?).max(LEAST_LIMIT_PX);
     let (worst, &rms_px) = errors
         .iter()

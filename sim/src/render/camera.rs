@@ -35,6 +35,8 @@ pub(crate) struct EyePose {
 pub struct StereoCamera {
     left: Lens,
     right: Lens,
+    /// Yaw, depression, roll.
+    mount_rad: [f64; 3],
     body_from_left: Matrix3<f64>,
     left_from_right: Matrix3<f64>,
     /// Right camera's centre in left-camera components, metres.
@@ -52,12 +54,23 @@ impl StereoCamera {
         Self {
             left: Lens::new(rig.camera(Eye::Left)),
             right: Lens::new(rig.camera(Eye::Right)),
+            mount_rad: [mount.yaw_rad, mount.depression_rad, mount.roll_rad],
             body_from_left: body_from_camera(mount.yaw_rad, mount.depression_rad, mount.roll_rad),
             // x_right = R x_left + T is zero at the right eye's own centre.
             right_in_left_m: -(left_from_right * rig.right_from_left_translation_m()),
             left_from_right,
             lever_arm_m: rig.lever_arm().metres(),
         }
+    }
+
+    /// The same rig, mounted otherwise than its file says: yaw, depression, roll beyond it, radians.
+    #[must_use]
+    pub fn with_mount_error(mut self, [yaw, depression, roll]: [f64; 3]) -> Self {
+        let [y, d, r] = self.mount_rad;
+        self.mount_rad = [y + yaw, d + depression, r + roll];
+        let [y, d, r] = self.mount_rad;
+        self.body_from_left = body_from_camera(y, d, r);
+        self
     }
 
     /// Columns and rows of an eye's image.

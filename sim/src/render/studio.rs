@@ -792,3 +792,108 @@ impl RayGrid {
         (between(a.0, b.0, c.0, d.0), between(a.1, b.1, c.1, d.1))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::world::WorldConfig;
+    use emberfix_calib::Rig;
+    use nalgebra::Matrix3;
+    use std::path::Path;
+
+    fn studio() -> Studio {
+        let rig = Rig::parse(
+            include_str!("../../../calib/rigs/oakd-75mm.toml"),
+            Path::new("oakd-75mm"),
+        )
+        .unwrap();
+        let world = World::new(&WorldConfig::default(), 1).unwrap();
+        Studio::new(Arc::new(world), StereoCamera::new(&rig))
+    }
+
+    /// A flame 8 m ahead and 4.6 m down, where the camera looks.
+    fn shot() -> Shot {
+        Shot {
+            body: BodyState {
+                t_s: 0.0,
+                position_m: Vector3::zeros(),
+                enu_from_body: Matrix3::new(0.0, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, -1.0),
+                velocity_m_s: Vector3::zeros(),
+                rate_rad_s: Vector3::zeros(),
+            },
+            t_s: 9.0,
+            fires: vec![StudioFire {
+                seed: 4,
+                base_m: Vector3::new(0.0, 8.0, -5.2),
+                width_m: 0.7,
+                height_m: 1.1,
+                wind_m_s: Vector2::zeros(),
+            }],
+            backdrop: Backdrop::Ground { up_m: -5.2 },
+            daylight: 0.2,
+            branches: Vec::new(),
+            puffs: Vec::new(),
+        }
+    }
+
+    fn look() -> Look {
+        Look {
+            skew_s: 0.0,
+            gain: 1.0,
+            blur_px: 0.6,
+            glare: 0.0,
+            noise_sigma_dn: 2.0,
+            near_infrared: false,
+            dirt: Vec::new(),
+            seed: 1,
+        }
+    }
+
+    #[test]
+    fn the_depth_that_is_seen_is_within_the_flame() {
+        let (sin, cos) = 30.0_f64.to_radians().sin_cos();
+        let axis = Vector3::new(0.0, cos, -sin);
+        let (_, seen) = studio().expose_left(&shot(), &look(), &axis);
+        let seen = seen.unwrap();
+        // The lever arm puts the eye 0.12 m ahead and 0.06 m down of the body.
+        let base = Vector3::new(0.0, 8.0 - 0.12, -5.2 + 0.06).dot(&axis);
+        let (near, far) = (base - 1.1 * sin - 0.4, base + 0.4);
+        let depth = 1.0 / seen.inverse_depth_per_m;
+        assert!((near..far).contains(&depth), "{depth} m of {near} to {far}");
+        assert!(seen.pixels > 500, "{}", seen.pixels);
+    }
+
+    #[test]
+    fn a_later_exposure_shows_another_flame_and_a_gain_another_brightness() {
+        let (studio, shot) = (studio(), shot());
+        let bytes = |look: &Look| studio.expose(&shot, Eye::Right, look).bytes;
+        let first = bytes(&look());
+        assert_eq!(first, bytes(&look()));
+        let later = Look {
+            skew_s: 0.02,
+            ..look()
+        };
+        assert_ne!(first, bytes(&later));
+        let sum = |bytes: &[u8]| bytes.iter().map(|b| u64::from(*b)).sum::<u64>();
+        let dimmer = Look {
+            gain: 0.5,
+            ..look()
+        };
+        assert!(sum(&bytes(&dimmer)) < sum(&first));
+    }
+
+    #[test]
+    fn what_lives_in_one_eye_is_not_in_the_other() {
+        let (studio, mut lit) = (studio(), shot());
+        lit.puffs.push(Puff {
+            centre_m: Vector3::new(0.0, 7.8, -4.9),
+            radius_m: 0.2,
+            kind: PuffKind::Light { strength: 3.0 },
+            only: Some(Eye::Right),
+        });
+        let same = |eye| {
+            studio.expose(&shot(), eye, &look()).bytes == studio.expose(&lit, eye, &look()).bytes
+        };
+        assert!(same(Eye::Left) && !same(Eye::Right));
+    }
+}

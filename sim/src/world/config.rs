@@ -20,6 +20,8 @@ pub struct WorldConfig {
     pub smokes: Vec<SmokeConfig>,
     /// Things that a detector takes for fire.
     pub lookalikes: Vec<LookalikeConfig>,
+    /// Chessboards that lie on the ground, to calibrate by.
+    pub boards: Vec<BoardConfig>,
     /// Trees and bushes.
     pub trees: TreesConfig,
     /// Sun and sky.
@@ -38,6 +40,7 @@ impl Default for WorldConfig {
             spreads: Vec::new(),
             smokes: Vec::new(),
             lookalikes: Vec::new(),
+            boards: Vec::new(),
             trees: TreesConfig::default(),
             light: LightConfig::default(),
             wind: WindConfig::default(),
@@ -187,6 +190,30 @@ pub enum LookalikeKind {
     OrangeVehicle,
     /// A steady orange lamp.
     Lantern,
+}
+
+/// A chessboard that lies level on the ground, with a white margin of one square.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct BoardConfig {
+    /// Where its middle lies.
+    pub east_m: f64,
+    /// Where its middle lies.
+    pub north_m: f64,
+    /// Inner corners along its longer side.
+    pub columns: u32,
+    /// Inner corners along its shorter side.
+    pub rows: u32,
+    /// Side of a square.
+    pub square_m: f64,
+    /// Its longer side from east towards north.
+    #[serde(default)]
+    pub turn_deg: f64,
+}
+
+impl BoardConfig {
+    /// Of the printed side above the ground, metres.
+    pub const THICKNESS_M: f64 = 0.03;
 }
 
 /// Trees and bushes, strewn at random.

@@ -18,7 +18,7 @@ mod texture;
 mod things;
 
 pub use config::{
-    FireConfig, GroundCover, LightConfig, LookalikeConfig, LookalikeKind, SmokeConfig,
+    BoardConfig, FireConfig, GroundCover, LightConfig, LookalikeConfig, LookalikeKind, SmokeConfig,
     SpreadConfig, TerrainConfig, TreesConfig, WindConfig, WorldConfig,
 };
 
@@ -158,6 +158,7 @@ impl World {
             terrain,
         };
         world.place_lookalikes(&config.lookalikes);
+        world.place_boards(&config.boards);
         world.place_trees(config);
         world.scorch();
         Ok(world)
@@ -192,6 +193,23 @@ impl World {
             sum += reaches.fold(f64::NEG_INFINITY, f64::max);
         }
         Some(sum / f64::from(REACH_TIMES))
+    }
+
+    /// Light of all flames from a place: face in m² times flicker over the squared range.
+    #[must_use]
+    pub fn flame_light(&self, from_m: &Vector3<f64>, t_s: f64) -> f64 {
+        let light = |fire: usize| {
+            let flame = self.flame(fire, t_s)?;
+            let truth = &self.fires[fire];
+            let age_s = t_s - truth.ignites_at_s;
+            let sites = truth.spread.map_or(1, |spread| {
+                spread.sites(flame.seed, flame.width_m, age_s).len()
+            });
+            let face_m2 = sites as f64 * flame.width_m * flame.height_m;
+            let range2_m2 = (flame.base_m - from_m).norm_squared().max(1.0);
+            Some(face_m2 * flame.flicker() * flame.temper() / range2_m2)
+        };
+        (0..self.fires.len()).filter_map(light).sum()
     }
 
     pub(crate) fn terrain(&self) -> &Terrain {
@@ -282,12 +300,13 @@ impl World {
         let splats = sites.iter().enumerate().flat_map(|(k, site)| {
             let foot = flame.base_m.xy() + site;
             Flame {
-                // A site is known by its place: it keeps its flame while others come and go.
-                seed: hash(
-                    flame.seed,
-                    (site.x * 64.0) as i32 as u32,
-                    (site.y * 64.0) as i32 as u32,
-                ) ^ u64::from(k == 0),
+                // A flame of the front goes with it, a site keeps its own while others come and go.
+                seed: if k < Spread::FRONT {
+                    hash(flame.seed, k as u32, 0xF07)
+                } else {
+                    let cell = [site.x, site.y].map(|metres| (metres * 64.0) as i32 as u32);
+                    hash(flame.seed, cell[0], cell[1])
+                },
                 base_m: Vector3::new(foot.x, foot.y, self.ground_up_m(foot.x, foot.y)),
                 ..flame
             }
@@ -357,6 +376,13 @@ impl World {
         }
     }
 
+    fn place_boards(&mut self, boards: &[BoardConfig]) {
+        for board in boards {
+            let foot = self.foot(board.east_m, board.north_m);
+            self.things.add_board(foot, board);
+        }
+    }
+
     fn place_trees(&mut self, config: &WorldConfig) {
         let sun = self.sun();
         let mut rng = ChaCha8Rng::seed_from_u64(config.trees.seed ^ self.seed.rotate_left(17));
@@ -401,9 +427,11 @@ fn places(config: &WorldConfig) -> Vec<Vector2<f64>> {
     let fires = config.fires.iter().map(|f| (f.east_m, f.north_m));
     let smokes = config.smokes.iter().map(|s| (s.east_m, s.north_m));
     let lookalikes = config.lookalikes.iter().map(|l| (l.east_m, l.north_m));
+    let boards = config.boards.iter().map(|b| (b.east_m, b.north_m));
     fires
         .chain(smokes)
         .chain(lookalikes)
+        .chain(boards)
         .map(|(east, north)| Vector2::new(east, north))
         .collect()
 }
@@ -464,6 +492,13 @@ fn check(config: &WorldConfig) -> Result<(), WorldError> {
         let key = |name: &str| format!("lookalikes[{k}].{name}");
         check_place(&key, thing.east_m, thing.north_m)?;
         range(&key("size_m"), thing.size_m, 0.02, 100.0)?;
+    }
+    for (k, board) in config.boards.iter().enumerate() {
+        let key = |name: &str| format!("boards[{k}].{name}");
+        check_place(&key, board.east_m, board.north_m)?;
+        range(&key("columns"), f64::from(board.columns), 2.0, 20.0)?;
+        range(&key("rows"), f64::from(board.rows), 2.0, 20.0)?;
+        range(&key("square_m"), board.square_m, 0.01, 5.0)?;
     }
     check_surroundings(config)
 }

@@ -1,6 +1,7 @@
 //! Opaque things on the ground, and marks on it.
 
 use super::burning::{Splat, SplatKind, unit};
+use super::config::BoardConfig;
 use nalgebra::{Vector2, Vector3};
 use std::f64::consts::TAU;
 
@@ -257,6 +258,41 @@ impl Things {
             rows: 0.0,
         });
         self.quads.extend(quads);
+    }
+
+    /// A chessboard on the ground: black squares on a white sheet.
+    pub(crate) fn add_board(&mut self, foot: Vector3<f64>, board: &BoardConfig) {
+        const WHITE: [f32; 3] = [0.85, 0.85, 0.85];
+        const BLACK: [f32; 3] = [0.03, 0.03, 0.03];
+        let (sin, cos) = board.turn_deg.to_radians().sin_cos();
+        let along = Vector3::new(cos, sin, 0.0) * board.square_m;
+        let across = Vector3::new(-sin, cos, 0.0) * board.square_m;
+        // Squares are one more than inner corners, the margin is one square more on each side.
+        let (columns, rows) = (board.columns + 1, board.rows + 1);
+        let printed = foot + Vector3::z() * BoardConfig::THICKNESS_M;
+        let corner = printed - (along * f64::from(columns) + across * f64::from(rows)) * 0.5;
+        let mut add = |corner_m, along_m, across_m, albedo| {
+            self.quads.push(Quad {
+                corner_m,
+                along_m,
+                across_m,
+                albedo,
+                rows: 0.0,
+            });
+        };
+        add(
+            // A hair lower, so that the squares lie on it.
+            corner - along - across - Vector3::z() * 0.002,
+            along * f64::from(columns + 2),
+            across * f64::from(rows + 2),
+            WHITE,
+        );
+        for (column, row) in (0..columns).flat_map(|c| (0..rows).map(move |r| (c, r))) {
+            if (column + row) % 2 == 0 {
+                let at = corner + along * f64::from(column) + across * f64::from(row);
+                add(at, along, across, BLACK);
+            }
+        }
     }
 
     /// A steady lamp on a stake.

@@ -70,7 +70,9 @@ impl MountingArguments {
             Some(path) => Some(Rig::load(path).map_err(Failure::refused)?),
             None => None,
         };
-        let like = like.as_ref().map(|rig| (Mounting::of(rig), rig.max_skew_s()));
+        let like = like
+            .as_ref()
+            .map(|rig| (Mounting::of(rig), rig.max_skew_s()));
         let mut missing = Vec::new();
         let mut number = |given: Option<f64>, known: Option<f64>, like: Option<f64>, flag| {
             given.or(known).or(like).unwrap_or_else(|| {
@@ -105,9 +107,24 @@ impl MountingArguments {
         let arm = |axis: usize| given_arm.map(|arm| arm[axis]);
         let known_arm = |axis: usize| known.lever_arm_m.map(|arm| arm[axis]);
         let lever_arm_m = Vector3::new(
-            number(arm(0), known_arm(0), of(|m| m.lever_arm_m.x), "--lever-arm-m"),
-            number(arm(1), known_arm(1), of(|m| m.lever_arm_m.y), "--lever-arm-m"),
-            number(arm(2), known_arm(2), of(|m| m.lever_arm_m.z), "--lever-arm-m"),
+            number(
+                arm(0),
+                known_arm(0),
+                of(|m| m.lever_arm_m.x),
+                "--lever-arm-m",
+            ),
+            number(
+                arm(1),
+                known_arm(1),
+                of(|m| m.lever_arm_m.y),
+                "--lever-arm-m",
+            ),
+            number(
+                arm(2),
+                known_arm(2),
+                of(|m| m.lever_arm_m.z),
+                "--lever-arm-m",
+            ),
         );
         let mounting = Mounting {
             angles,

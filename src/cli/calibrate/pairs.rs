@@ -60,7 +60,9 @@ fn collect(folder: &Path, depth: usize, found: &mut Vec<PathBuf>) -> std::io::Re
 }
 
 fn is_image(path: &Path) -> bool {
-    let ending = path.extension().map(|ending| ending.to_string_lossy().to_ascii_lowercase());
+    let ending = path
+        .extension()
+        .map(|ending| ending.to_string_lossy().to_ascii_lowercase());
     ending.is_some_and(|ending| ENDINGS.contains(&ending.as_str()))
 }
 
@@ -105,7 +107,9 @@ fn without(path: &str, eye: &str) -> Option<String> {
         // A digit after a digit is another number: cam0 is not in cam01.
         let more = eye.ends_with(|c: char| c.is_ascii_digit())
             && lower[after..].starts_with(|c: char| c.is_ascii_digit());
-        !touches(lower[..at].chars().next_back()) && !touches(lower[after..].chars().next()) && !more
+        !touches(lower[..at].chars().next_back())
+            && !touches(lower[after..].chars().next())
+            && !more
     })?;
     Some(format!("{}*{}", &path[..at], &path[at + eye.len()..]))
 }
@@ -116,7 +120,11 @@ fn short(rest: &str) -> String {
     let stem = path.file_stem().map(|stem| stem.to_string_lossy());
     let stem = stem.unwrap_or_default();
     let trimmed = stem.trim_matches(|c: char| !c.is_alphanumeric());
-    if trimmed.is_empty() { rest.to_owned() } else { trimmed.to_owned() }
+    if trimmed.is_empty() {
+        rest.to_owned()
+    } else {
+        trimmed.to_owned()
+    }
 }
 
 #[cfg(test)]
@@ -152,7 +160,11 @@ mod tests {
     #[test]
     fn what_has_no_partner_stays_alone() {
         assert_eq!(names(&["left01.jpg", "right02.jpg"]), []);
-        assert_eq!(names(&["girl.png", "rig.png"]), [], "letters inside words name no eye");
+        assert_eq!(
+            names(&["girl.png", "rig.png"]),
+            [],
+            "letters inside words name no eye"
+        );
         assert_eq!(names(&["cam01_3.png", "cam11_3.png"]), []);
     }
 

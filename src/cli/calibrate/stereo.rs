@@ -1,6 +1,5 @@
 //! `emberfix calibrate stereo`: both eyes and the pair, from pictures of a board.
 
-use super::live::{self, LiveArguments};
 use super::mounting::{Asked, Known, MountingArguments};
 use super::pairs::{self, FilePair};
 use crate::cli::Failure;
@@ -20,16 +19,14 @@ use std::path::PathBuf;
 #[derive(Debug, clap::Args)]
 pub struct StereoArguments {
     /// Folders and image files; pairs are found by their names (left/right, L/R, cam0/cam1, nir/vis).
+    #[arg(required = true)]
     images: Vec<PathBuf>,
-    /// Inner corners of a chessboard (9x6), or charuco:COLUMNSxROWS:DICTIONARY in squares.
+    /// Inner corners of the chessboard, such as 9x6.
     #[arg(long)]
     board: String,
     /// Side of a square, millimetres: measure the print.
     #[arg(long)]
     square_mm: f64,
-    /// Side of a ChArUco marker, millimetres; three quarters of a square if not given.
-    #[arg(long)]
-    marker_mm: Option<f64>,
     /// Rig file to write; what pictures can't tell is then needed, see below.
     #[arg(long)]
     out: Option<PathBuf>,
@@ -49,17 +46,12 @@ pub struct StereoArguments {
     #[arg(long)]
     json: bool,
     #[command(flatten)]
-    live: LiveArguments,
-    #[command(flatten)]
     mounting: MountingArguments,
 }
 
 /// Solves, tells, writes.
 pub fn stereo(arguments: &StereoArguments) -> Result<(), Failure> {
     let board = board(arguments)?;
-    if let Some(url) = &arguments.live.live {
-        return live::guide(url, &board, &arguments.live);
-    }
     let asked = match &arguments.out {
         Some(_) => Some(arguments.mounting.ask(&Known::default())?),
         None => None,
@@ -77,7 +69,7 @@ pub fn stereo(arguments: &StereoArguments) -> Result<(), Failure> {
     tell(arguments, &looked, &calibration)?;
     if let Some(path) = &arguments.report {
         let html = report(arguments, &pairs, &calibration)?;
-        write(path, &html)?;
+        super::write(path, &html)?;
     }
     if calibration.is_refused() {
         return Err(Failure::Refused(anyhow!(
@@ -92,16 +84,12 @@ pub fn stereo(arguments: &StereoArguments) -> Result<(), Failure> {
 }
 
 fn board(arguments: &StereoArguments) -> Result<Board, Failure> {
-    let board =
-        Board::parse(&arguments.board, 1e-3 * arguments.square_mm).map_err(Failure::refused)?;
-    match arguments.marker_mm {
-        Some(mm) => board.with_marker_m(1e-3 * mm).map_err(Failure::refused),
-        None => Ok(board),
-    }
+    Board::parse(&arguments.board, 1e-3 * arguments.square_mm).map_err(Failure::refused)
 }
 
 fn file_pairs(places: &[PathBuf]) -> Result<Vec<FilePair>, Failure> {
-    let files = pairs::images(places).map_err(|error| Failure::Refused(anyhow!("images: {error}")))?;
+    let files =
+        pairs::images(places).map_err(|error| Failure::Refused(anyhow!("images: {error}")))?;
     let pairs = pairs::pair_up(&files);
     if pairs.is_empty() {
         return Err(Failure::Refused(anyhow!(
@@ -147,8 +135,12 @@ fn look(pairs: &[FilePair], board: &Board) -> Result<Looked, Failure> {
                 let view = make_consistent(board, View { name, left, right });
                 looked.views.push(view);
             }
-            (Err(why), _) => looked.unusable.push((pair.name.clone(), format!("left: {why}"))),
-            (_, Err(why)) => looked.unusable.push((pair.name.clone(), format!("right: {why}"))),
+            (Err(why), _) => looked
+                .unusable
+                .push((pair.name.clone(), format!("left: {why}"))),
+            (_, Err(why)) => looked
+                .unusable
+                .push((pair.name.clone(), format!("right: {why}"))),
         }
     }
     Ok(looked)
@@ -271,7 +263,10 @@ fn summary(calibration: &Calibration) -> Result<Table, Failure> {
         calibration.held_out.rms_px
     );
     table.add_row(["reprojection error", &errors]);
-    let rows = format!("{:.3} px", epipolar_rms_px(calibration).map_err(Failure::failed)?);
+    let rows = format!(
+        "{:.3} px",
+        epipolar_rms_px(calibration).map_err(Failure::failed)?
+    );
     table.add_row(["row difference, rectified", &rows]);
     table.add_row(["focal length, left", &with(0)]);
     table.add_row(["focal length, right", &with(9)]);
@@ -384,16 +379,11 @@ fn report(
         at: &now(),
         board: &format!("{}, {} mm squares", arguments.board, arguments.square_mm),
         calibration,
-        pair: images.as_ref().map(|(left, right)| (middle.as_str(), left, right)),
+        pair: images
+            .as_ref()
+            .map(|(left, right)| (middle.as_str(), left, right)),
     };
     page(&input).map_err(Failure::failed)
-}
-
-fn write(path: &std::path::Path, text: &str) -> Result<(), Failure> {
-    std::fs::write(path, text)
-        .map_err(|error| Failure::Failed(anyhow!("{}: {error}", path.display())))?;
-    eprintln!("written: {}", path.display());
-    Ok(())
 }
 
 /// A fresh calibration still drifts with warmth and knocks; nobody has measured less.
@@ -406,7 +396,10 @@ fn write_rig(
     calibration: &Calibration,
 ) -> Result<(), Failure> {
     let solution = &calibration.solution;
-    let at_10m = calibration.range_errors.iter().find(|error| error.depth_m == 10.0);
+    let at_10m = calibration
+        .range_errors
+        .iter()
+        .find(|error| error.depth_m == 10.0);
     let parts = RigParts {
         name: rig_name(arguments),
         left: solution.left.clone(),
@@ -425,5 +418,5 @@ fn write_rig(
         }),
     };
     parts.check(path).map_err(Failure::refused)?;
-    write(path, &parts.to_toml())
+    super::write(path, &parts.to_toml())
 }

@@ -1,15 +1,84 @@
 //! `emberfix eval calibration`.
 
 use crate::cli::Failure;
+use crate::eval::calibration::{Options, measure};
+use crate::eval::{Report, boresight};
+use indicatif::{ProgressBar, ProgressStyle};
+use std::path::PathBuf;
 
 /// Calibration of simulated rigs with known truth.
 #[derive(Debug, clap::Args)]
 pub struct CalibrationArguments {
+    /// Seed of rigs, poses and noise.
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Simulated rigs; every second one has a near-infrared left eye.
+    #[arg(long, default_value_t = 20)]
+    rigs: usize,
+    /// Pairs of pictures a rig.
+    #[arg(long, default_value_t = 40)]
+    pairs: usize,
+    /// Folder of the real pictures `left01.jpg` ..; that of EMBERFIX_SHARED or ../shared if not given.
+    #[arg(long)]
+    chess_a: Option<PathBuf>,
+    /// Rendered flights past a surveyed board, to find mount and clock by; 0 for none.
+    #[arg(long, default_value_t = 4)]
+    flights: u32,
+    /// Mission of those flights.
+    #[arg(long, default_value = "missions/marker.toml")]
+    flight_mission: PathBuf,
     #[command(flatten)]
     common: super::Common,
 }
 
 /// Measures and shows.
-pub fn calibration(_arguments: &CalibrationArguments) -> Result<(), Failure> {
-    Err(Failure::Refused(anyhow::anyhow!("not there yet")))
+pub fn calibration(arguments: &CalibrationArguments) -> Result<(), Failure> {
+    let options = Options {
+        seed: arguments.seed,
+        rigs: arguments.rigs,
+        pairs: arguments.pairs,
+        chess_a: chess_a(arguments),
+    };
+    let bar = ProgressBar::new(arguments.rigs as u64).with_message("simulated rigs");
+    if let Ok(style) = ProgressStyle::with_template("{msg} {wide_bar} {pos}/{len}") {
+        bar.set_style(style);
+    }
+    let report = measure(&options, || bar.inc(1)).map_err(Failure::failed)?;
+    bar.finish_and_clear();
+    let report = with_flights(arguments, report)?;
+    super::show(&arguments.common, "calibration", &report)
+}
+
+/// The flights' figures behind the rigs'.
+fn with_flights(arguments: &CalibrationArguments, report: Report) -> Result<Report, Failure> {
+    if arguments.flights == 0 {
+        return Ok(report);
+    }
+    let bar = ProgressBar::new(arguments.flights.into()).with_message("rendered flights");
+    if let Ok(style) = ProgressStyle::with_template("{msg} {wide_bar} {pos}/{len}") {
+        bar.set_style(style);
+    }
+    let options = boresight::Options {
+        flights: arguments.flights,
+        seed: arguments.seed,
+    };
+    let flown = boresight::measure(&arguments.flight_mission, options, &mut |done| {
+        bar.set_position(done.into());
+    });
+    bar.finish_and_clear();
+    Ok(report.with("boresight", flown.map_err(Failure::failed)?))
+}
+
+fn chess_a(arguments: &CalibrationArguments) -> Option<PathBuf> {
+    if arguments.chess_a.is_some() {
+        return arguments.chess_a.clone();
+    }
+    let shared =
+        std::env::var_os("EMBERFIX_SHARED").map_or_else(|| "../shared".into(), PathBuf::from);
+    let folder = shared.join("data/stereo/chess_a");
+    if folder.is_dir() {
+        return Some(folder);
+    }
+    eprintln!("not measured: {} is not there (chess_a)", folder.display());
+    None
 }

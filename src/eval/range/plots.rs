@@ -1,6 +1,6 @@
 //! Sigma, error and bias as pictures.
 
-use super::outcome::{BEST, FULL_FRAME, NAMES};
+use super::outcome::{BEST, NAMES};
 use super::subpixel::Step;
 use super::tables::{Line, Measured};
 use emberfix_report::{Axis, Chart, Mark, Series, Sheet};
@@ -71,7 +71,7 @@ fn error(table: &Measured) -> Chart {
         Axis::log("mean error, % of the range").within(0.05, 2000.0),
     );
     let mut chart = Chart::new(format!("{}: error", table.series.name), axes.0, axes.1);
-    for method in 0..NAMES.len() {
+    for (method, name) in NAMES.into_iter().enumerate() {
         let points = table.lines_of(method);
         let points = points
             .iter()
@@ -81,7 +81,7 @@ fn error(table: &Measured) -> Chart {
         } else {
             Mark::Line
         };
-        chart = chart.with(Series::new(NAMES[method], mark, points.collect()));
+        chart = chart.with(Series::new(name, mark, points.collect()));
     }
     let printed = table.series.distances_m.iter().copied();
     let printed: Vec<(f64, f64)> = printed
@@ -99,15 +99,11 @@ fn subpixel(steps: &[Step]) -> Chart {
         Axis::linear("fraction of the disparity, px"),
         Axis::linear("mean error, px").within(-0.4, 0.6),
     );
-    for method in 0..FULL_FRAME.end {
+    for (method, name) in NAMES.into_iter().enumerate() {
         let points = steps
             .iter()
             .filter_map(|step| Some((step.fraction_px, step.methods[method].bias_px?)));
-        chart = chart.with(Series::new(
-            NAMES[method],
-            Mark::LineAndDots,
-            points.collect(),
-        ));
+        chart = chart.with(Series::new(name, Mark::LineAndDots, points.collect()));
     }
     chart
 }

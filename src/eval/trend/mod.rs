@@ -2,7 +2,7 @@
 //!
 //! **In:** a seed, a noise model, a rig. **Out:** P1's trend experiment with all methods side by side
 //! ([`contest`]), and size and spread of rendered fires against truth ([`flights`]). Accuracies are
-//! percent, margins percentage points, size and speed errors percent of the truth (root of the mean
+//! percent, margins percentage points; size and speed errors percent of the truth (root of the mean
 //! square), directions degrees (root of the mean square), coverages shares.
 
 pub mod burns;
@@ -139,7 +139,21 @@ fn second_figures(contest: &Contest) -> Vec<Figure> {
     ]
 }
 
+/// A height whose own sigma is a greater share than this is told as unknown: from above, a deep
+/// fire's flames can't be told from its far side.
+const MEASURED: f64 = 0.3;
+
+/// All widths, and the heights that claim to be measured.
 fn sizes(flown: &[Outcome]) -> Vec<Pair> {
+    let measured = |outcome: &Outcome| {
+        Some(outcome.height).filter(|height| height.sigma <= MEASURED * height.told)
+    };
+    let widths = flown.iter().map(|outcome| outcome.width);
+    widths.chain(flown.iter().filter_map(measured)).collect()
+}
+
+/// All widths and all heights.
+fn sides(flown: &[Outcome]) -> Vec<Pair> {
     flown
         .iter()
         .flat_map(|outcome| [outcome.width, outcome.height])
@@ -174,7 +188,13 @@ fn flight_figures(flown: &[Outcome]) -> Vec<Figure> {
             20.0,
             sizes.len(),
         ),
-        coverage("size.coverage90", &sizes),
+        coverage("size.coverage90", &sides(flown)),
+        Figure::told(
+            "size.heights_measured_share",
+            share(sizes.len() - flown.len(), flown.len()),
+            "",
+            flown.len(),
+        ),
         bounded(
             "spread.speed_error",
             rms(&speeds, |p| 100.0 * p.share()),

@@ -65,6 +65,12 @@ const DOUBT = {
   geoid_applied: "The height comes from a geoid model, not from the receiver.",
   attitude_slow: "The autopilot’s attitude came too seldom.",
   position_slow: "The autopilot’s position came too seldom.",
+  spectral_silent: "The spectrometer gives nothing: intensity is from the camera alone.",
+  spectral_blinded: "The spectrometer is covered: intensity is from the camera alone.",
+  spectral_frozen: "The spectrometer repeats itself: intensity is from the camera alone.",
+  visible_silent: "The camera sees no flame there: intensity is from the spectrometer alone.",
+  visible_blinded: "The camera’s view is covered: intensity is from the spectrometer alone.",
+  visible_frozen: "The camera’s light does not change: intensity is from the spectrometer alone.",
 };
 
 function age(ms) {
@@ -240,6 +246,23 @@ function place(label, [x, y], taken) {
   for (const [key, value] of [["x", spot.dx], ["y", spot.dy], ["text-anchor", spot.anchor]]) label.setAttribute(key, value);
 }
 
+// Burning ground and front line, in the mark's own coordinates; from another aircraft there may be none.
+function drawArea(p, [x, y]) {
+  const path = (corners) => corners.map((corner, k) => {
+    const [px, py] = toScreen(toPlane(corner));
+    return `${k ? "L" : "M"}${(px - x).toFixed(1)},${(py - y).toFixed(1)}`;
+  }).join(" ");
+  const polygon = p.area?.polygon;
+  if (!polygon?.length || p.state === "out") return [];
+  const ground = el("path", { class: "ground", d: `${path(polygon)}Z` });
+  // The front's corners may run over the polygon's seam: begin after the gap.
+  const inFront = new Set(p.area.front.map(String));
+  const start = polygon.findIndex((c, k) => inFront.has(String(c)) && !inFront.has(String(polygon.at(k - 1))));
+  if (start < 0) return [ground];
+  const turned = [...polygon.slice(start), ...polygon.slice(0, start)].filter((c) => inFront.has(String(c)));
+  return [ground, el("path", { class: "front", d: path(turned) })];
+}
+
 function drawFire(feature, taken) {
   const p = feature.properties, [x, y] = toScreen(toPlane(feature.geometry.coordinates));
   const { major, minor, degrees } = ellipse(p.covariance_enu_m2);
@@ -253,6 +276,9 @@ function drawFire(feature, taken) {
   // SVG turns clockwise with y down; the ellipse's direction runs from east towards north.
   mark.append(el("ellipse", { class: "ring", rx, ry, transform: `rotate(${-degrees})` }));
   mark.append(p.class === "smoke" ? el("circle", { class: "sign", r: 6 }) : el("path", { class: "sign", d: "M0,-9 L8,5 L-8,5Z" }));
+  const [ground, front] = drawArea(p, [x, y]);
+  if (ground) mark.prepend(ground);
+  if (front) mark.append(front);
   const label = el("text", { class: "label" });
   label.textContent = p.id;
   const fine = el("tspan", { class: "fine" });
@@ -327,6 +353,61 @@ function basis(p) {
   return `${methods}; ${p.sightings} sighting${p.sightings === 1 ? "" : "s"}, last from ${metres(p.range_m)}`;
 }
 
+// --- how it burns ----------------------------------------------------------------------------
+
+const SIZE = { small: "small", medium: "medium", large: "large" };
+const COMPASS = ["north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west"];
+const towards = (deg) => COMPASS[Math.round((((deg % 360) + 360) % 360) / 45) % 8];
+
+function sizeText(p) {
+  if (!p.size_m) return null;
+  const off = p.size_sigma_m;
+  const side = (m, sigma) => metres(m) + (sigma ? ` ± ${metres(sigma)}` : "");
+  const kind = SIZE[p.size_class] ? `${SIZE[p.size_class]}: ` : "";
+  return `${kind}${side(p.size_m.width, off?.width)} wide, ${side(p.size_m.height, off?.height)} high`;
+}
+
+function areaText(p) {
+  const area = p.area?.square_metres;
+  if (!area) return null;
+  const round = (v) => (v < 10 ? v.toFixed(1) : Math.round(v).toString());
+  return `${round(area.value)} ± ${round(area.sigma)} m² burning`;
+}
+
+function spreadText(p) {
+  const s = p.spread;
+  if (!s) return null;
+  const deg = String(Math.round(s.azimuth_deg.value) % 360).padStart(3, "0");
+  return `to the ${towards(s.azimuth_deg.value)} (${deg}° ± ${Math.round(s.azimuth_deg.sigma)}°), `
+    + `${s.speed_m_s.value.toFixed(2)} ± ${s.speed_m_s.sigma.toFixed(2)} m/s`;
+}
+
+function trendText(p) {
+  if (p.trend === null || p.trend === undefined) return null;
+  const percent = (v) => Math.abs(100 * v).toFixed(1);
+  const sign = p.trend < 0 ? "−" : "+";
+  const off = p.trend_sigma === null || p.trend_sigma === undefined ? "" : ` ± ${percent(p.trend_sigma)}`;
+  return `${sign}${percent(p.trend)}${off} % per second`;
+}
+
+// Intensity over the last minute: one line, its latest point, and the level at the start of it.
+function intensityChart(p) {
+  const points = p.intensity_history ?? [];
+  if (points.length < 3) return null;
+  const [w, h, air] = [360, 56, 4];
+  const times = points.map(([t]) => t), levels = points.map(([, v]) => v);
+  const first = Math.min(...times), last = Math.max(...times), top = Math.max(...levels, 1e-9) * 1.1;
+  const place = ([t, v]) => [air + (w - 2 * air) * (t - first) / Math.max(last - first, 1e-9), h - air - (h - 2 * air) * v / top];
+  const line = points.map((point, k) => `${k ? "L" : "M"}${place(point).map((v) => v.toFixed(1)).join(",")}`).join(" ");
+  const change = levels.at(-1) / Math.max(levels[0], 1e-9);
+  const words = `Intensity over ${Math.round(last - first)} s: now ${change.toFixed(1)} times what it was`;
+  const svg = el("svg", { class: "intensity", viewBox: `0 0 ${w} ${h}`, role: "img", "aria-label": words });
+  const [, start] = place(points[0]), [x, y] = place(points.at(-1));
+  svg.append(el("path", { class: "level", d: `M${air},${start} H${w - air}` }), el("path", { class: "course", d: line }),
+    el("circle", { class: "now", cx: x, cy: y, r: 3.5 }));
+  return html("figure", { class: "burning" }, svg, html("figcaption", {}, words));
+}
+
 function facts(rows) {
   const list = html("dl", { class: "facts" });
   for (const [term, text] of rows) if (text) list.append(html("dt", {}, term), html("dd", {}, text));
@@ -348,10 +429,15 @@ function entry(feature) {
   item.append(facts([
     ["Accuracy", `CE90 ${metres(p.ce90_m)}, LE90 ${metres(p.le90_m)}`],
     ["Height", heights(feature)],
-    ["Size", p.size_m && `${metres(p.size_m.width)} wide, ${metres(p.size_m.height)} high`],
+    ["Size", sizeText(p)],
+    ["Ground", areaText(p)],
+    ["Intensity", trendText(p)],
+    ["Runs", spreadText(p)],
     ["Based on", basis(p)],
     ["To place it better", p.advice && `fly ${metres(p.advice.distance_m)} on course ${String(Math.round(p.advice.course_deg)).padStart(3, "0")}°: CE90 about ${metres(p.advice.ce90_m)}`],
   ]));
+  const burning = intensityChart(p);
+  if (burning) item.append(burning);
   if (p.degraded.length) {
     const same = (reason) => reason.match(/^merged_into_(\d+)$/)?.[1];
     const plain = (reason) => DOUBT[reason]
@@ -479,6 +565,10 @@ function connect() {
   on("time", (time) => setClock(time.now));
   on("alarm", (feature, event) => { lastId = event.lastEventId; takeAlarm(feature); });
   on("track", takePosition);
+  on("test", ({ at, link, uav }) => {
+    $("tested-text").textContent = `${new Date(at).toLocaleTimeString("en-GB")}: test alarm from ${uav} over ${link} arrived. There is no fire.`;
+    $("tested").hidden = false;
+  });
   on("refused", ({ at, link, reason }) => {
     $("refused-text").textContent = `${new Date(at).toLocaleTimeString("en-GB")}: a report over ${link} was not taken. ${reason}`;
     $("refused").hidden = false;
@@ -567,6 +657,7 @@ function point([px, py]) {
 }
 
 function fit() { view.following = true; draw(); }
+$("tested-seen").addEventListener("click", () => { $("tested").hidden = true; });
 $("refused-seen").addEventListener("click", () => { $("refused").hidden = true; });
 $("fit").addEventListener("click", fit);
 $("zoom-in").addEventListener("click", () => zoom(1.5));

@@ -1,0 +1,444 @@
+//! The batch: Gauss-Newton, damped, robust.
+
+use super::model::{Model, N, Parameter, Parameters, Sight, Start, mount_of, part};
+use emberfix_frames::{MountAngles, UnitQuaternion, Vector3};
+use nalgebra::{Matrix3, SMatrix, SVector};
+
+type Normal = SMatrix<f64, N, N>;
+
+/// Why there is no solution.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum SolveError {
+    /// Too little to solve from.
+    #[error("the marker was seen in {sights} pictures, needed are {least} at least")]
+    TooFew {
+        /// Pictures.
+        sights: usize,
+        /// Needed.
+        least: usize,
+    },
+    /// Most sights agree with no one marker.
+    #[error(
+        "{outliers} of {sights} sights agree with no fixed point: was the same marker picked in each \
+         picture, is it where it was said to be, is this the rig of the flight?"
+    )]
+    NoAgreement {
+        /// Sights that disagree.
+        outliers: usize,
+        /// All of them.
+        sights: usize,
+    },
+    /// The numbers ran away.
+    #[error("the solution is not finite; rays may be parallel: fly past the marker, not at it")]
+    NotFinite,
+}
+
+/// What the flight showed.
+#[derive(Debug, Clone)]
+pub struct Solution {
+    /// Every parameter, see [`Parameter`].
+    pub parameters: SVector<f64, N>,
+    /// Covariance of all parameters.
+    pub covariance: SMatrix<f64, N, N>,
+    /// One sigma of every parameter beforehand.
+    pub before: SVector<f64, N>,
+    /// The mount as found.
+    pub mount: MountAngles,
+    /// The lever arm as found, metres.
+    pub arm_m: Vector3<f64>,
+    /// Sights that were used.
+    pub used: usize,
+    /// Sights that disagree with the rest.
+    pub outliers: usize,
+    /// Root mean square of what is left over per axis, pixels, of those that were used.
+    pub rms_px: f64,
+    /// By how much neighbours' likeness widened the covariance (variance).
+    pub widened: f64,
+    /// Share of the sights, in time, that turned left, and right, faster than a degree a second.
+    pub turned: (f64, f64),
+    /// Turn rate about all axes, root mean square, rad/s.
+    pub rate_rad_s: f64,
+    /// Whether the marker was surveyed.
+    pub surveyed: bool,
+}
+
+/// Fewest pictures.
+const LEAST: usize = 8;
+/// Clock offsets from which the search starts, seconds.
+const CLOCK_STARTS_S: [f64; 7] = [-0.45, -0.3, -0.15, 0.0, 0.15, 0.3, 0.45];
+/// Steps of a first look, and of the final search.
+const STEPS: (usize, usize) = (15, 50);
+/// Cauchy's constant: 95 % as good as least squares when nothing is wrong.
+const CAUCHY: f64 = 2.385;
+/// Sigmas beyond which a sight disagrees.
+const OUTLIER: f64 = 5.0;
+/// Scale of the residuals, in sights' sigmas, beyond which this is no scatter but disagreement.
+const MOST_SCALE: f64 = 8.0;
+/// A step that gains less than this share has arrived.
+const SETTLED: f64 = 1e-8;
+/// Sights of a first look.
+const FIRST_LOOK: usize = 60;
+/// Share of sights that may disagree.
+const MOST_OUTLIERS: f64 = 0.5;
+/// Turn of the nose that counts as a turn, rad/s.
+const TURNING_RAD_S: f64 = 0.0175;
+
+impl Solution {
+    /// One parameter.
+    #[must_use]
+    pub fn value(&self, parameter: Parameter) -> f64 {
+        self.parameters[parameter as usize]
+    }
+
+    /// One sigma of a parameter.
+    #[must_use]
+    pub fn sigma(&self, index: usize) -> f64 {
+        self.covariance[(index, index)].max(0.0).sqrt()
+    }
+
+    /// Correlation of two parameters.
+    #[must_use]
+    pub fn correlation(&self, a: usize, b: usize) -> f64 {
+        self.covariance[(a, b)] / (self.sigma(a) * self.sigma(b)).max(1e-30)
+    }
+
+    /// One sigma of mount yaw and heading error together: where the camera points over ground.
+    #[must_use]
+    pub fn bearing_sigma(&self) -> f64 {
+        let (yaw, heading) = (Parameter::MountYaw as usize, Parameter::Heading as usize);
+        let c = &self.covariance;
+        // A nose that is said to be too far right is undone by a camera that looks further right.
+        (c[(yaw, yaw)] + c[(heading, heading)] - 2.0 * c[(yaw, heading)])
+            .max(0.0)
+            .sqrt()
+    }
+
+    /// The mount, the arm and the clock as a rig file should have them; the clock is added to the rig's.
+    #[must_use]
+    pub fn clock_s(&self) -> f64 {
+        self.value(Parameter::Clock)
+    }
+
+    /// One sigma of the boresight, radians: the worst of its axes.
+    #[must_use]
+    pub fn boresight_sigma(&self) -> f64 {
+        (0..3).map(|axis| self.sigma(axis)).fold(0.0, f64::max)
+    }
+}
+
+/// Solves for everything.
+///
+/// # Errors
+/// [`SolveError`].
+pub fn solve(start: &Start, sights: &[Sight]) -> Result<Solution, SolveError> {
+    if sights.len() < LEAST {
+        return Err(SolveError::TooFew {
+            sights: sights.len(),
+            least: LEAST,
+        });
+    }
+    let every = sights.len().div_ceil(FIRST_LOOK);
+    let few: Vec<Sight> = sights.iter().step_by(every).cloned().collect();
+    let glance = Batch {
+        start,
+        sights: &few,
+    };
+    let first_looks = CLOCK_STARTS_S.map(|clock| glance.search(glance.begin(clock), STEPS.0));
+    let best = first_looks
+        .into_iter()
+        .min_by(|a, b| a.robust.total_cmp(&b.robust))
+        .ok_or(SolveError::NotFinite)?;
+    let batch = Batch { start, sights };
+    let found = batch.search(best.x, STEPS.1);
+    batch.conclude(&found)
+}
+
+struct Batch<'a> {
+    start: &'a Start,
+    sights: &'a [Sight],
+}
+
+/// Where a search stands.
+struct Found {
+    x: Parameters,
+    /// In sights' sigmas.
+    residuals: Vec<SVector<f64, 2>>,
+    /// Scale of the residuals, in sights' sigmas.
+    scale: f64,
+    /// Median of the residuals' lengths, in sights' sigmas: compares searches, whatever their scale.
+    robust: f64,
+}
+
+impl Batch<'_> {
+    fn begin(&self, clock_s: f64) -> Parameters {
+        let mut x = Parameters::zeros();
+        x[Parameter::Clock as usize] = clock_s;
+        let marker = self.start.marker_m.unwrap_or_else(|| self.meeting(&x));
+        x.fixed_rows_mut::<3>(Parameter::Marker as usize)
+            .copy_from(&marker);
+        x
+    }
+
+    /// The point nearest to all rays: where an unsurveyed marker may be.
+    fn meeting(&self, x: &Parameters) -> Vector3<f64> {
+        let (mut normal, mut sum) = (Matrix3::identity() * 1e-9, Vector3::zeros());
+        let body_from_camera = self.start.body_from_camera;
+        for sight in self.sights {
+            let Some(body) = sight.way.at(x[Parameter::Clock as usize]) else {
+                continue;
+            };
+            let ray = body.enu_from_body * (body_from_camera * self.direction(sight));
+            let camera = body.position_m + body.enu_from_body * self.start.arm_m;
+            let across = Matrix3::identity() - ray * ray.transpose();
+            normal += across;
+            sum += across * camera;
+        }
+        normal
+            .try_inverse()
+            .map_or_else(Vector3::zeros, |inverse| inverse * sum)
+    }
+
+    /// Unit vector of a raw pixel, distortion undone by fixed-point steps on the forward model.
+    fn direction(&self, sight: &Sight) -> Vector3<f64> {
+        let camera = &self.start.camera;
+        let mut ray = Vector3::new(0.0, 0.0, 1.0);
+        for _ in 0..10 {
+            let seen = camera.project(&ray);
+            ray.x += (sight.pixel.u - seen.u) / camera.focal_px.0;
+            ray.y += (sight.pixel.v - seen.v) / camera.focal_px.1;
+        }
+        ray.normalize()
+    }
+
+    /// Residual of every sight in its sigmas; what cannot be seen is far off.
+    fn residuals(&self, x: &Parameters) -> Vec<SVector<f64, 2>> {
+        let model = Model::new(self.start, x);
+        let one = |sight: &Sight| match model.predict(&sight.way) {
+            Some(pixel) => {
+                SVector::<f64, 2>::new(pixel.u - sight.pixel.u, pixel.v - sight.pixel.v)
+                    / sight.sigma_px
+            }
+            None => SVector::repeat(UNSEEN / sight.sigma_px),
+        };
+        self.sights.iter().map(one).collect()
+    }
+
+    /// Cauchy's cost at a scale, and the cost of leaving what was known beforehand; in units of the
+    /// sights' sigma², whatever the scale.
+    fn cost(&self, x: &Parameters, residuals: &[SVector<f64, 2>], scale: f64) -> f64 {
+        let width = CAUCHY * scale;
+        let one = |residual: &SVector<f64, 2>| (residual.norm() / width).powi(2).ln_1p();
+        let seen: f64 = residuals.iter().map(one).sum();
+        seen * width * width + self.known(x).norm_squared() * scale * scale
+    }
+
+    /// Distance from what was known, in its sigmas.
+    fn known(&self, x: &Parameters) -> Parameters {
+        let mut known = *x;
+        let marker = Parameter::Marker as usize;
+        match self.start.marker_m {
+            Some(surveyed) => {
+                let off = part(x, Parameter::Marker) - surveyed;
+                known.fixed_rows_mut::<3>(marker).copy_from(&off);
+            }
+            None => known.fixed_rows_mut::<3>(marker).fill(0.0),
+        }
+        known.component_div(&self.start.sigmas)
+    }
+
+    fn search(&self, mut x: Parameters, steps: usize) -> Found {
+        let mut residuals = self.residuals(&x);
+        let mut scale = scale_of(&residuals);
+        let mut cost = self.cost(&x, &residuals, scale);
+        let mut damping = 1e-3;
+        let mut system = self.linearise(&x, &residuals, scale);
+        for _ in 0..steps {
+            let (normal, gradient) = &system;
+            let damped = normal + Normal::from_diagonal(&(normal.diagonal() * damping));
+            let there = damped.cholesky().map(|c| x - c.solve(gradient));
+            let then = there.map(|there| {
+                let residuals = self.residuals(&there);
+                (self.cost(&there, &residuals, scale), there, residuals)
+            });
+            match then {
+                Some((less, there, left)) if less < cost => {
+                    let settled = cost - less < SETTLED * cost;
+                    (x, residuals) = (there, left);
+                    damping = (damping * 0.2).max(1e-9);
+                    // The scale only shrinks: as the fit gets better, fewer sights are far off.
+                    scale = scale.min(scale_of(&residuals));
+                    cost = self.cost(&x, &residuals, scale);
+                    system = self.linearise(&x, &residuals, scale);
+                    if settled {
+                        break;
+                    }
+                }
+                _ if damping > 1e9 => break,
+                _ => damping *= 5.0,
+            }
+        }
+        Found {
+            robust: median_length(&residuals),
+            residuals,
+            scale,
+            x,
+        }
+    }
+
+    /// Normal equations, weighted; what was known beforehand is in them.
+    fn linearise(
+        &self,
+        x: &Parameters,
+        residuals: &[SVector<f64, 2>],
+        scale: f64,
+    ) -> (Normal, Parameters) {
+        let known = Parameters::from_element(1.0).component_div(&self.start.sigmas);
+        let weight = scale * scale;
+        let mut normal = Normal::from_diagonal(&(known.component_mul(&known) * weight));
+        let mut gradient = self.known(x).component_mul(&known) * weight;
+        for (by, residual) in self.derivatives(x, residuals).iter().zip(residuals) {
+            let weight = cauchy_weight(residual.norm(), scale);
+            normal += by.transpose() * by * weight;
+            gradient += by.transpose() * residual * weight;
+        }
+        (normal, gradient)
+    }
+
+    /// Of every sight's residual over the parameters, by forward differences.
+    fn derivatives(
+        &self,
+        x: &Parameters,
+        residuals: &[SVector<f64, 2>],
+    ) -> Vec<SMatrix<f64, 2, N>> {
+        let mut all = vec![SMatrix::<f64, 2, N>::zeros(); residuals.len()];
+        for index in 0..N {
+            let step = step_of(index);
+            let mut there = *x;
+            there[index] += step;
+            let moved = self.residuals(&there);
+            for ((by, after), before) in all.iter_mut().zip(&moved).zip(residuals) {
+                by.set_column(index, &((after - before) / step));
+            }
+        }
+        all
+    }
+
+    fn conclude(&self, found: &Found) -> Result<Solution, SolveError> {
+        let x = found.x;
+        let limit = OUTLIER * found.scale.min(MOST_SCALE);
+        let kept: Vec<usize> = (0..self.sights.len())
+            .filter(|sight| found.residuals[*sight].norm() <= limit)
+            .collect();
+        let outliers = self.sights.len() - kept.len();
+        if outliers as f64 > MOST_OUTLIERS * self.sights.len() as f64 || kept.len() < LEAST {
+            return Err(SolveError::NoAgreement {
+                outliers,
+                sights: self.sights.len(),
+            });
+        }
+        let widened = widening(kept.iter().map(|sight| found.residuals[*sight]));
+        let covariance = self.covariance(found, widened);
+        let covariance = covariance
+            .filter(|c| c.iter().all(|value| value.is_finite()) && x.iter().all(|v| v.is_finite()))
+            .ok_or(SolveError::NotFinite)?;
+        Ok(Solution {
+            mount: self.mount(&x),
+            arm_m: self.start.arm_m + part(&x, Parameter::Arm),
+            used: kept.len(),
+            outliers,
+            rms_px: self.rms_px(found, &kept),
+            widened,
+            turned: self.turned(),
+            rate_rad_s: self.rate_rad_s(),
+            surveyed: self.start.marker_m.is_some(),
+            before: self.start.sigmas,
+            parameters: x,
+            covariance,
+        })
+    }
+
+    /// What was measured, at its own scale and widened, and what was known beforehand.
+    fn covariance(&self, found: &Found, widened: f64) -> Option<Normal> {
+        let known = Parameters::from_element(1.0).component_div(&self.start.sigmas);
+        let mut information = Normal::from_diagonal(&known.component_mul(&known));
+        let derivatives = self.derivatives(&found.x, &found.residuals);
+        for (by, residual) in derivatives.iter().zip(&found.residuals) {
+            let weight = cauchy_weight(residual.norm(), found.scale);
+            information += by.transpose() * by * (weight / (found.scale.powi(2) * widened));
+        }
+        // Scaled by what was known, so that radians and metres of kilometres do not spoil the inverse.
+        let units = Normal::from_diagonal(&self.start.sigmas);
+        let inverse = (units * information * units).cholesky()?.inverse();
+        Some(units * inverse * units)
+    }
+
+    fn mount(&self, x: &Parameters) -> MountAngles {
+        let turn = UnitQuaternion::from_scaled_axis(part(x, Parameter::MountRoll));
+        mount_of(&(turn.to_rotation_matrix().into_inner() * self.start.body_from_camera))
+    }
+
+    fn rms_px(&self, found: &Found, kept: &[usize]) -> f64 {
+        let square =
+            |k: &usize| (found.residuals[*k] * self.sights[*k].sigma_px).norm_squared() / 2.0;
+        (kept.iter().map(square).sum::<f64>() / kept.len().max(1) as f64).sqrt()
+    }
+
+    fn turned(&self) -> (f64, f64) {
+        let share = |turning: &dyn Fn(f64) -> bool| {
+            let rates = self.sights.iter().map(|sight| sight.way.yaw_rate_rad_s());
+            rates.filter(|rate| turning(*rate)).count() as f64 / self.sights.len() as f64
+        };
+        (
+            share(&|rate| rate < -TURNING_RAD_S),
+            share(&|rate| rate > TURNING_RAD_S),
+        )
+    }
+
+    fn rate_rad_s(&self) -> f64 {
+        let squares = self.sights.iter().map(|s| s.way.rate_rad_s().powi(2));
+        (squares.sum::<f64>() / self.sights.len() as f64).sqrt()
+    }
+}
+
+/// Residual of a marker that should be behind the camera, pixels.
+const UNSEEN: f64 = 3000.0;
+
+fn cauchy_weight(length: f64, scale: f64) -> f64 {
+    1.0 / (1.0 + (length / (CAUCHY * scale)).powi(2))
+}
+
+/// Step of the numerical derivative: far above rounding, far below what matters.
+fn step_of(index: usize) -> f64 {
+    const CLOCK: usize = Parameter::Clock as usize;
+    match index {
+        CLOCK => 1e-4,
+        0..3 | 7..10 => 1e-7,
+        _ => 1e-5,
+    }
+}
+
+/// Sigma of the residuals per axis, in sights' sigmas, from their median length; never below what the
+/// sights claim of themselves.
+fn scale_of(residuals: &[SVector<f64, 2>]) -> f64 {
+    // Median length of a two-dimensional normal distribution of sigma 1.
+    (median_length(residuals) / 1.1774).max(1.0)
+}
+
+fn median_length(residuals: &[SVector<f64, 2>]) -> f64 {
+    let mut lengths: Vec<f64> = residuals.iter().map(SVector::norm).collect();
+    lengths.sort_by(f64::total_cmp);
+    lengths.get(lengths.len() / 2).copied().unwrap_or(0.0)
+}
+
+/// Factor on the variance for neighbours that resemble each other: `(1 + r) / (1 - r)` for a
+/// first-order process whose neighbours correlate by `r`.
+fn widening(residuals: impl Iterator<Item = SVector<f64, 2>>) -> f64 {
+    let (mut power, mut along, mut before) = (1e-30, 0.0, None);
+    for residual in residuals {
+        power += residual.norm_squared();
+        along += before.map_or(0.0, |before: SVector<f64, 2>| before.dot(&residual));
+        before = Some(residual);
+    }
+    let r = (along / power).clamp(0.0, 0.95);
+    (1.0 + r) / (1.0 - r)
+}
