@@ -275,7 +275,9 @@ fn answer(
     let allowed =
         (2.0 * errors.gnss_horizontal_m.powi(2) + (OBSERVABLE_SHARE * case.slant_m).powi(2)).sqrt();
     let observable = bound_m.is_some_and(|bound| bound <= allowed);
-    let batch = (observable && beside == Beside::AllAtOnce).then(|| solve_at_once(errors, staged)).flatten();
+    let batch = (observable && beside == Beside::AllAtOnce)
+        .then(|| solve_at_once(errors, staged))
+        .flatten();
     let printed = printed(&staged.lens, &told, false);
     Ok(Flown {
         case,
