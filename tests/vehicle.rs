@@ -185,6 +185,7 @@ fn record_images(tape: &mut Tape, folder: &Path, names: &[String]) {
             at,
         };
         let value = StereoPair {
+            spectra: Vec::new(),
             sequence: sequence as u64,
             arrived: at + SignedDuration::from_millis(30),
             left,
