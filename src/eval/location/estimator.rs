@@ -104,6 +104,8 @@ pub struct Told {
 pub struct Learned {
     /// All that turns the camera against the reported attitude, about body axes, radians.
     pub pointing_rad: Vector3<f64>,
+    /// Its sigma about each axis, radians.
+    pub pointing_sigma_rad: Vector3<f64>,
     /// The mount's own share of it.
     pub boresight_rad: Vector3<f64>,
     /// Camera clock late, seconds.
@@ -199,6 +201,7 @@ impl Pilot {
         let value = |of: &[Estimated; 3]| Vector3::from_fn(|axis, _| of[axis].value);
         Some(Learned {
             pointing_rad: value(&shared.pointing_rad),
+            pointing_sigma_rad: Vector3::from_fn(|axis, _| shared.pointing_rad[axis].sigma),
             boresight_rad: value(&shared.boresight_rad),
             clock_s: shared.clock_s.value,
             clock_sigma_s: shared.clock_s.sigma,

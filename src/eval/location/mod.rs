@@ -30,11 +30,12 @@ use flight::Kind;
 use incidents::Incidents;
 use indicatif::ProgressBar;
 use law::Law;
-use monte_carlo::{Case, Flown, fly};
-use mount::MountFlown;
+use monte_carlo::{Beside, Case, Flown, fly};
+use mount::{Air, MountFlown};
 use p3::P3Flown;
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
+use truth::Gnss;
 
 /// What to measure.
 #[derive(Debug, Clone)]
@@ -59,6 +60,9 @@ pub struct Options {
     pub kinds: Vec<Kind>,
 }
 
+/// One flight in so many (prime to the classes' turns) is solved all at once as well.
+const AT_ONCE: usize = 7;
+
 /// Everything that was flown.
 #[derive(Debug, Clone)]
 pub struct Campaign {
@@ -68,8 +72,10 @@ pub struct Campaign {
     pub foreign: Vec<(Law, Vec<Flown>)>,
     /// P3's flight.
     pub p3: Vec<P3Flown>,
-    /// Bent mounts and late clocks in gusts.
+    /// Bent mounts and late clocks in gusts, RTK and a good heading.
     pub gusty: Vec<MountFlown>,
+    /// The same with a consumer receiver and compass.
+    pub gusty_consumer: Vec<MountFlown>,
     /// Late clocks in steady air.
     pub steady: Vec<MountFlown>,
     /// Over one fire.
@@ -87,7 +93,7 @@ impl Options {
         let flights = self.flights
             + Law::FOREIGN.len() * self.foreign_flights
             + self.p3_flights
-            + 2 * self.mount_flights
+            + 3 * self.mount_flights
             + 2 * self.incident_flights
             + self.timed_fires.len();
         flights as u64
@@ -116,7 +122,13 @@ impl Options {
     /// [`SetupError`] when a rig is refused.
     pub fn fly(&self, law: Law, count: usize, bar: &ProgressBar) -> Result<Vec<Flown>, SetupError> {
         self.each(&format!("{law:?}"), count, bar, |index, rng| {
-            fly(Case::drawn(rng, &self.kinds, index), law, self.errors, rng)
+            let beside = match law {
+                Law::Assumed if index / self.kinds.len() % AT_ONCE == 0 => Beside::AllAtOnce,
+                Law::Assumed => Beside::Bound,
+                _ => Beside::Nothing,
+            };
+            let case = Case::drawn(rng, &self.kinds, index);
+            fly(case, law, self.errors, beside, rng)
         })
     }
 
@@ -134,8 +146,9 @@ impl Options {
             flown: self.fly(Law::Assumed, self.flights, bar)?,
             foreign,
             p3: self.each("p3", self.p3_flights, bar, |_, rng| p3::fly(rng))?,
-            gusty: self.mounts(true, bar)?,
-            steady: self.mounts(false, bar)?,
+            gusty: self.mounts(Air::Gusty(Gnss::Rtk), bar)?,
+            gusty_consumer: self.mounts(Air::Gusty(Gnss::Consumer), bar)?,
+            steady: self.mounts(Air::Steady, bar)?,
             one: self.each("one fire", incidents, bar, |_, rng| {
                 incidents::one_fire(rng)
             })?,
@@ -146,10 +159,10 @@ impl Options {
         })
     }
 
-    fn mounts(&self, gusty: bool, bar: &ProgressBar) -> Result<Vec<MountFlown>, SetupError> {
-        let purpose = format!("mount, gusty: {gusty}");
+    fn mounts(&self, air: Air, bar: &ProgressBar) -> Result<Vec<MountFlown>, SetupError> {
+        let purpose = format!("mount {air:?}");
         let flown = self.each(&purpose, self.mount_flights, bar, |_, rng| {
-            mount::fly(rng, gusty)
+            mount::fly(rng, air)
         })?;
         Ok(flown.into_iter().flatten().collect())
     }

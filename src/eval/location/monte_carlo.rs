@@ -186,11 +186,28 @@ pub fn stage_with<'a>(scene: &Scene<'a>, wandered: &[Slow], rng: &mut ChaCha8Rng
     }
 }
 
+/// What is worked out for a flight beside its alarms.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Beside {
+    /// Nothing.
+    Nothing,
+    /// The bound.
+    Bound,
+    /// The bound and all looks solved at once.
+    AllAtOnce,
+}
+
 /// Flies one case and scores it; all errors are `scale` times what they usually are.
 ///
 /// # Errors
 /// [`SetupError`] when the rig is refused.
-pub fn fly(case: Case, law: Law, scale: f64, rng: &mut ChaCha8Rng) -> Result<Flown, SetupError> {
+pub fn fly(
+    case: Case,
+    law: Law,
+    scale: f64,
+    beside: Beside,
+    rng: &mut ChaCha8Rng,
+) -> Result<Flown, SetupError> {
     let course = Course::drawn(rng, case.kind, case.slant_m, case.height_m);
     let errors = ErrorModel::of(case.gnss, case.heading_deg).scaled(scale);
     let steepest = STEEPEST * case.height_m / course.ground_range_m.max(1.0);
@@ -220,10 +237,15 @@ pub fn fly(case: Case, law: Law, scale: f64, rng: &mut ChaCha8Rng) -> Result<Flo
         law,
         times_s: &times_s,
     };
-    answer(case, &errors, &stage(&scene, rng))
+    answer(case, &errors, beside, &stage(&scene, rng))
 }
 
-fn answer(case: Case, errors: &ErrorModel, staged: &Staged<'_>) -> Result<Flown, SetupError> {
+fn answer(
+    case: Case,
+    errors: &ErrorModel,
+    beside: Beside,
+    staged: &Staged<'_>,
+) -> Result<Flown, SetupError> {
     let mut pilot = Pilot::new(&staged.lens, errors, staged.ground)?;
     let (mut first, mut last, mut fires) = (None, None, 0);
     for look in &staged.looks {
@@ -246,12 +268,16 @@ fn answer(case: Case, errors: &ErrorModel, staged: &Staged<'_>) -> Result<Flown,
         .filter_map(|look| Some((look.autopilot.report(0.0), look.seen?)))
         .collect();
     let ground = staged.ground.as_ref();
-    let bound = bound(&staged.lens, errors, &staged.flame, &truths, ground);
+    let bound = (beside != Beside::Nothing)
+        .then(|| bound(&staged.lens, errors, &staged.flame, &truths, ground))
+        .flatten();
     let bound_m = bound.map(|b| (b[(0, 0)] + b[(1, 1)]).sqrt());
     let allowed =
         (2.0 * errors.gnss_horizontal_m.powi(2) + (OBSERVABLE_SHARE * case.slant_m).powi(2)).sqrt();
     let observable = bound_m.is_some_and(|bound| bound <= allowed);
-    let batch = observable.then(|| solve_at_once(errors, staged)).flatten();
+    let batch = (observable && beside == Beside::AllAtOnce)
+        .then(|| solve_at_once(errors, staged))
+        .flatten();
     let printed = printed(&staged.lens, &told, false);
     Ok(Flown {
         case,

@@ -23,6 +23,8 @@ pub struct MountFlown {
     /// What is left of the camera's line of sight, degrees: estimated pointing minus the true one,
     /// across the line of sight.
     pub pointing_error_deg: f64,
+    /// The estimator's own sigma of that.
+    pub pointing_sigma_deg: f64,
     /// The same for the mount's share alone (boresight), about the body axes.
     pub boresight_error_deg: f64,
     /// Estimated clock minus the true one, milliseconds.
@@ -37,17 +39,39 @@ pub struct MountFlown {
     pub error_m: f64,
 }
 
-/// One orbit (80 m out, 60 m up, 9 m/s, 3 looks per second). In steady air the orbit is a perfect
-/// circle about the fire, and only the clock is off.
+/// How an orbit is flown.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Air {
+    /// Gusts of 3 degrees; boresight and clock are off.
+    Gusty(Gnss),
+    /// A perfect circle about the fire; only the clock is off.
+    Steady,
+}
+
+impl Air {
+    /// With RTK goes a heading of 0.5 degrees (two antennas); with a consumer receiver a compass of
+    /// 1 degree. A receiver that wanders by a metre turns the bearing at 80 m by as much as a degree:
+    /// what it leaves of the camera's direction nobody can find from a fire.
+    fn errors(self) -> ErrorModel {
+        let (gnss, heading_deg, boresight_deg) = match self {
+            Self::Gusty(Gnss::Rtk) => (Gnss::Rtk, 0.5, BORESIGHT_DEG),
+            Self::Gusty(Gnss::Consumer) => (Gnss::Consumer, 1.0, BORESIGHT_DEG),
+            Self::Steady => (Gnss::Consumer, 1.0, 0.3),
+        };
+        ErrorModel {
+            boresight_deg,
+            clock_s: CLOCK_S,
+            ..ErrorModel::of(gnss, heading_deg)
+        }
+    }
+}
+
+/// One orbit (80 m out, 60 m up, 9 m/s, 3 looks per second).
 ///
 /// # Errors
 /// [`SetupError`] when the rig is refused.
-pub fn fly(rng: &mut ChaCha8Rng, gusty: bool) -> Result<Option<MountFlown>, SetupError> {
-    let errors = ErrorModel {
-        boresight_deg: if gusty { BORESIGHT_DEG } else { 0.3 },
-        clock_s: CLOCK_S,
-        ..ErrorModel::of(Gnss::Consumer, 1.0)
-    };
+pub fn fly(rng: &mut ChaCha8Rng, air: Air) -> Result<Option<MountFlown>, SetupError> {
+    let (errors, gusty) = (air.errors(), air != Air::Steady);
     let course = Course {
         kind: Kind::Orbit,
         ground_range_m: 80.0,
@@ -103,6 +127,7 @@ pub fn fly(rng: &mut ChaCha8Rng, gusty: bool) -> Result<Option<MountFlown>, Setu
     let boresight: Vector3<f64> = truth.fixed_rows::<3>(slow::BORESIGHT).into_owned();
     Ok(Some(MountFlown {
         pointing_error_deg: pointing.cross(&sight).norm().to_degrees(),
+        pointing_sigma_deg: learned.pointing_sigma_rad.cross(&sight).norm().to_degrees(),
         boresight_error_deg: (learned.boresight_rad - boresight).norm().to_degrees(),
         clock_error_ms: 1e3 * (learned.clock_s - truth[slow::CLOCK]),
         clock_sigma_ms: 1e3 * learned.clock_sigma_s,
@@ -142,6 +167,8 @@ pub struct MountSummary {
     pub flights: usize,
     /// Root mean square of the pointing error, degrees.
     pub pointing_rms_deg: f64,
+    /// Root mean square of the estimator's own sigma of it, degrees.
+    pub pointing_sigma_deg: f64,
     /// Root mean square of the boresight's own error, degrees.
     pub boresight_rms_deg: f64,
     /// Root mean square of the clock's error, milliseconds.
@@ -168,6 +195,7 @@ pub fn summary(flown: &[MountFlown]) -> MountSummary {
     MountSummary {
         flights: flown.len(),
         pointing_rms_deg: rms(|f| f.pointing_error_deg),
+        pointing_sigma_deg: rms(|f| f.pointing_sigma_deg),
         boresight_rms_deg: rms(|f| f.boresight_error_deg),
         clock_rms_ms: rms(|f| f.clock_error_ms),
         clock_sigma_ms: mean(flown.iter().map(|f| f.clock_sigma_ms)),

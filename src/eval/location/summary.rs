@@ -25,6 +25,7 @@ pub(super) fn report(options: &Options, campaign: &Campaign) -> Report {
     );
     let p3 = p3::summary(&campaign.p3);
     let gusty = mount::summary(&campaign.gusty);
+    let consumer = mount::summary(&campaign.gusty_consumer);
     let steady = mount::summary(&campaign.steady);
     let mut figures = consistency_figures(campaign);
     let worst = cells
@@ -37,7 +38,7 @@ pub(super) fn report(options: &Options, campaign: &Campaign) -> Report {
         most("location.rmse_over_bound", worst, "", 1.15, observable),
     );
     figures.extend(p3_figures(&p3));
-    figures.extend(mount_figures(&gusty, &steady));
+    figures.extend(mount_figures(&gusty, &consumer, &steady));
     figures.extend(incident_figures(campaign));
     figures.extend(time_figures(campaign));
     figures.push(alarmed(&campaign.flown));
@@ -65,11 +66,13 @@ pub(super) fn report(options: &Options, campaign: &Campaign) -> Report {
                 "heading_deg": [0.5, 1.0, 2.0],
             },
             "cells": &cells,
+            "worst": least_honest(&campaign.flown),
             "kinds": kinds(&campaign.flown),
             "laws": &laws,
             "p3": p3,
             "p3_printed_m": printed_errors_m(),
             "mount": gusty,
+            "mount_consumer": consumer,
             "steady_orbit": steady,
             "one_fire": &campaign.one,
             "two_fires_flown": &campaign.two,
@@ -81,6 +84,18 @@ pub(super) fn report(options: &Options, campaign: &Campaign) -> Report {
         plots: plots::plots(&campaign.flown, &cells, &laws),
     }
 }
+
+/// The flights whose last alarm was the least honest: where to look first.
+fn least_honest(flown: &[Flown]) -> Vec<&Flown> {
+    let nees = |f: &Flown| f.last.map_or(0.0, |last| last.nees);
+    let mut worst: Vec<&Flown> = flown.iter().collect();
+    worst.sort_by(|a, b| nees(b).total_cmp(&nees(a)));
+    worst.truncate(WORST);
+    worst
+}
+
+/// How many of them are shown.
+const WORST: usize = 30;
 
 /// Tables of the parts that were flown.
 fn tables(campaign: &Campaign, cells: &[Cell], laws: &[LawRow]) -> Vec<Table> {
@@ -95,8 +110,7 @@ fn tables(campaign: &Campaign, cells: &[Cell], laws: &[LawRow]) -> Vec<Table> {
         tables.push(p3_table(&p3::summary(&campaign.p3)));
     }
     if !campaign.gusty.is_empty() {
-        let steady = mount::summary(&campaign.steady);
-        tables.push(mount_table(&mount::summary(&campaign.gusty), &steady));
+        tables.push(mount_table(campaign));
     }
     tables
 }
@@ -177,7 +191,11 @@ fn p3_figures(p3: &p3::P3Summary) -> Vec<Figure> {
     ]
 }
 
-fn mount_figures(gusty: &mount::MountSummary, steady: &mount::MountSummary) -> Vec<Figure> {
+fn mount_figures(
+    gusty: &mount::MountSummary,
+    consumer: &mount::MountSummary,
+    steady: &mount::MountSummary,
+) -> Vec<Figure> {
     let n = gusty.flights;
     let kept = steady.clock_sigma_ms / (1e3 * mount::CLOCK_S);
     vec![
@@ -193,6 +211,26 @@ fn mount_figures(gusty: &mount::MountSummary, steady: &mount::MountSummary) -> V
             real(gusty.clock_rms_ms),
             "ms",
             10.0,
+            n,
+        ),
+        Figure::told(
+            "location.boresight_error_consumer_deg",
+            real(consumer.pointing_rms_deg),
+            "deg",
+            n,
+        ),
+        most(
+            "location.clock_error_consumer_ms",
+            real(consumer.clock_rms_ms),
+            "ms",
+            10.0,
+            n,
+        ),
+        least(
+            "location.coverage90_before_found_consumer",
+            real(consumer.early_coverage90),
+            "",
+            0.88,
             n,
         ),
         least(
@@ -287,12 +325,14 @@ fn p3_table(p3: &p3::P3Summary) -> Table {
     }
 }
 
-fn mount_table(gusty: &mount::MountSummary, steady: &mount::MountSummary) -> Table {
-    let row = |what: &str, of: &mount::MountSummary| {
+fn mount_table(campaign: &Campaign) -> Table {
+    let row = |what: &str, flown: &[mount::MountFlown]| {
+        let of = mount::summary(flown);
         vec![
             what.to_owned(),
             of.flights.to_string(),
             metres(of.pointing_rms_deg),
+            metres(of.pointing_sigma_deg),
             metres(of.boresight_rms_deg),
             metres(of.clock_rms_ms),
             metres(of.clock_sigma_ms),
@@ -305,6 +345,7 @@ fn mount_table(gusty: &mount::MountSummary, steady: &mount::MountSummary) -> Tab
         "orbit",
         "flights",
         "pointing, deg",
+        "its sigma, deg",
         "boresight, deg",
         "clock, ms",
         "its sigma, ms",
@@ -315,6 +356,10 @@ fn mount_table(gusty: &mount::MountSummary, steady: &mount::MountSummary) -> Tab
     Table {
         title: "A clock 300 ms off, and in gusts a boresight 3 degrees off (RMS)".to_owned(),
         header: header.map(str::to_owned).to_vec(),
-        rows: vec![row("gusts", gusty), row("steady", steady)],
+        rows: vec![
+            row("gusts, RTK", &campaign.gusty),
+            row("gusts, consumer", &campaign.gusty_consumer),
+            row("steady, consumer", &campaign.steady),
+        ],
     }
 }
