@@ -3,7 +3,10 @@
 
 #![expect(clippy::unwrap_used, reason = "a test may stop at its first surprise")]
 
-#[expect(dead_code, reason = "the doctor of nothing never ends with exit code 0")]
+#[expect(
+    dead_code,
+    reason = "the doctor of nothing never ends with exit code 0"
+)]
 mod support;
 
 use serde_json::Value;
