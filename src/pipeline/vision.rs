@@ -41,8 +41,9 @@ pub struct Vision {
     compared: Option<ServiceTime>,
 }
 
-/// How often the eyes are compared: often enough to tell a crew, seldom enough to cost nothing.
-pub const COMPARE_EVERY: SignedDuration = SignedDuration::from_secs(1);
+/// How often the eyes are compared: often enough to tell a crew, seldom enough to cost nothing; a hair
+/// under a second, so that each pair of a camera of one a second is.
+pub const COMPARE_EVERY: SignedDuration = SignedDuration::from_millis(900);
 /// Margin about a box for its light, as a share of the box: box edges jitter, light must not.
 const GLOW_MARGIN: f64 = 0.25;
 /// Jitter of a box's edges: pixels at least, and as a share of the box. A bed of embers has a radius of a

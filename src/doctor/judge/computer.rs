@@ -151,7 +151,7 @@ fn clock(now: ServiceTime, autopilot_s: Option<f64>, ground_s: Option<f64>) -> F
     }
     let apart = [("the autopilot", autopilot_s), ("the ground", ground_s)];
     let mut verdict = Verdict::Pass;
-    let mut value = format!("{text}");
+    let mut value = text;
     for (who, ahead_s) in apart {
         if let Some(ahead_s) = ahead_s {
             verdict = verdict.max(APART_S.judge(ahead_s.abs()));
