@@ -190,7 +190,6 @@ fn record_images(tape: &mut Tape, folder: &Path, names: &[String]) {
             left,
             right: None,
             skew: SignedDuration::ZERO,
-            spectra: Vec::new(),
         };
         tape.write_pair(&Stamped { at, value }).unwrap();
     }

@@ -161,7 +161,8 @@ impl InverseDepth {
         for (number, reading) in (1..).zip(readings) {
             let corrected_m = 1.0 / self.corrected_per_m(1.0 / reading.measured_m);
             let percent = 100.0 * (corrected_m / reading.true_m - 1.0).abs();
-            if !(percent <= WORST_PERCENT) {
+            // NaN is no better than too much.
+            if percent.is_nan() || percent > WORST_PERCENT {
                 return Err(InverseDepthError::Scattered {
                     number,
                     true_m: reading.true_m,

@@ -107,7 +107,7 @@ const LEAST_LOOKS: usize = 6;
 /// fire and the speed of its head can't be told.
 const LEAST_OVAL_LOOKS: usize = 16;
 const LEAST_OVAL_S: f64 = 8.0;
-const LEAST_OVAL_DEG: f64 = 30.0;
+const LEAST_OVAL_DEG: f64 = 60.0;
 /// Seconds of looks that say how wide and how high it is now.
 const WIDTH_S: f64 = 10.0;
 const HEIGHT_S: f64 = 12.0;
@@ -120,8 +120,10 @@ const DEPTH_SIGMA: f64 = 0.4;
 const SURE: f64 = 3.0;
 const SURE_DEG: f64 = 20.0;
 /// Share of the speed, and degrees, that the oval itself is wrong by: fires are no ellipses.
-const SPEED_SHARE: f64 = 0.15;
-const DIRECTION_DEG: f64 = 2.0;
+const SPEED_SHARE: f64 = 0.17;
+const DIRECTION_DEG: f64 = 6.0;
+/// Share of the depth that it is wrong by for the same reason.
+const DEPTH_SHARE: f64 = 0.1;
 /// Prior of the rate A, m/s; it and the size are otherwise as likely in each octave.
 const RATE_PRIOR: f64 = 3.0;
 /// Slower than this nothing is told apart from standing still, m/s.
@@ -210,10 +212,11 @@ impl Outline {
 
     fn in_metres(&self, standing: &Standing, depth_m: f64) -> Option<Vec<(f64, InMetres)>> {
         let anchor = standing.foot.xy();
-        let now = self.looks.back()?.at;
+        let last = self.looks.back()?;
+        let middle = last.middle(&standing.foot, depth_m);
         let in_metres = |look: &Look| {
-            let metres = look.in_metres(&standing.foot, depth_m, &anchor)?;
-            Some(((look.at - now).as_secs_f64(), metres))
+            let metres = look.in_metres(&middle, depth_m, &anchor)?;
+            Some(((look.at - last.at).as_secs_f64(), metres))
         };
         let looks: Vec<(f64, InMetres)> = self.looks.iter().filter_map(in_metres).collect();
         (looks.len() >= LEAST_LOOKS).then_some(looks)
@@ -544,6 +547,7 @@ impl Shape {
             |node| node.solved[H] * across(node),
             |node| 4.0 * node.covariance[(H, H)],
         )
+        .or_share(DEPTH_SHARE)
     }
 
     fn spread(&self, standing: &Standing) -> Option<SpreadTold> {

@@ -360,7 +360,8 @@ mod tests {
 
     #[test]
     fn a_channel_that_dies_black_frozen_faded_or_missing_makes_no_dying_fire() {
-        let dead: [(&str, fn(usize, f64) -> Option<f64>); 5] = [
+        type Channel = fn(usize, f64) -> Option<f64>;
+        let dead: [(&str, Channel); 5] = [
             ("missing", |_, _| None),
             ("black", |_, _| Some(0.0)),
             ("nearly black", |k, value| {

@@ -87,16 +87,17 @@ impl Look {
         }
     }
 
-    /// The look in metres, when the fire's near edge stands at `foot` and its far one `depth_m`
-    /// behind; reaches count from `anchor`. Its sides are taken at half that depth. `None` when the
-    /// camera is right above, or a ray misses.
+    /// The look in metres, when the middle of the burning ground is at `middle` and it is `depth_m`
+    /// deep; reaches count from `anchor`. The sides are taken at the middle, the height at the near
+    /// edge. `None` when the camera is right above, or a ray misses.
     #[must_use]
     pub fn in_metres(
         &self,
-        foot: &Vector3<f64>,
+        middle: &Vector3<f64>,
         depth_m: f64,
         anchor: &Vector2<f64>,
     ) -> Option<InMetres> {
+        let foot = self.near_edge(middle, depth_m)?;
         let to_foot = foot - self.camera;
         let flat_m = to_foot.xy().norm();
         if flat_m < 0.5 || -to_foot.z > 8.0 * flat_m {
@@ -137,6 +138,21 @@ impl Look {
                 near.map(|near| reach(-sight, near, sigma_m / slope.min(1.0), -1.0 / slope)),
             ],
         })
+    }
+
+    /// The edge towards the camera.
+    fn near_edge(&self, middle: &Vector3<f64>, depth_m: f64) -> Option<Vector3<f64>> {
+        let sight = (middle - self.camera).xy().try_normalize(1e-3)?;
+        let back = sight * (depth_m / 2.0);
+        Some(middle - Vector3::new(back.x, back.y, 0.0))
+    }
+
+    /// The middle of burning ground that begins at `foot` and is `depth_m` deep, as seen from here.
+    #[must_use]
+    pub fn middle(&self, foot: &Vector3<f64>, depth_m: f64) -> Vector3<f64> {
+        let sight = (foot - self.camera).xy().try_normalize(1e-3);
+        let behind = sight.unwrap_or_default() * (depth_m / 2.0);
+        foot + Vector3::new(behind.x, behind.y, 0.0)
     }
 
     /// Where the lower edge's ray meets the level of the foot.

@@ -26,10 +26,10 @@ struct Honesty {
 
 fn honesty(method: Method) -> Honesty {
     let (scatter, depth, behind) = match method {
-        Method::Sgbm => (1.5, 0.10, 0.0),
+        Method::Sgbm => (2.0, 0.10, 0.0),
         Method::Centroid => (2.2, 0.10, 0.04),
-        Method::Correlate => (1.2, 0.10, 0.05),
-        Method::CrossSpectral => (1.5, 0.12, 0.08),
+        Method::Correlate => (1.2, 0.10, 0.035),
+        Method::CrossSpectral => (1.5, 0.12, 0.06),
         // It is made of the others, whose sigmas are honest already.
         Method::Best => (1.0, 0.0, 0.0),
     };

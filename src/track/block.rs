@@ -69,6 +69,12 @@ impl Measurement {
             noise: SVector::repeat(1.0),
         }
     }
+
+    /// True when a row says something.
+    #[must_use]
+    pub fn says(&self, row: usize) -> bool {
+        self.by_state.row(row).iter().any(|by| *by != 0.0)
+    }
 }
 
 /// A fire's coordinates as a function of the common state.
@@ -232,12 +238,14 @@ impl Block {
         self.own = (own + own.transpose()) * 0.5;
     }
 
-    /// Covariance of the coordinates, all errors.
+    /// Covariance of the position, all errors, m².
     #[must_use]
-    pub fn covariance(&self, common: &DMatrix<f64>) -> Own {
-        let mut with_common = ByCommon::zeros();
-        with_common.gemm(1.0, &self.by_common, common, 0.0);
-        let all = with_common * self.by_common.transpose() + self.own;
+    pub fn position_covariance(&self, state: &State, common: &DMatrix<f64>) -> Matrix3<f64> {
+        let slope = self.chart.position_by_state(state);
+        let by_common = slope * self.by_common;
+        let mut with_common = SMatrix::<f64, 3, COMMON>::zeros();
+        with_common.gemm(1.0, &by_common, common, 0.0);
+        let all = with_common * by_common.transpose() + slope * self.own * slope.transpose();
         (all + all.transpose()) * 0.5
     }
 }

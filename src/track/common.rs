@@ -210,25 +210,24 @@ impl Common {
         })
     }
 
-    /// Takes measurements in: `residual = rows (s - mean) + noise` of unit variance. Returns by how
-    /// much the mean moved.
-    pub fn update(&mut self, rows: &DMatrix<f64>, residual: &DVector<f64>) {
-        if rows.nrows() == 0 {
+    /// Takes measurements in: `residual = columns' (s - mean) + noise` of unit variance.
+    pub fn update(&mut self, columns: &DMatrix<f64>, residual: &DVector<f64>) {
+        if columns.ncols() == 0 {
             return;
         }
-        if rows.nrows() <= COMMON / 2 {
-            self.update_by_rows(rows, residual);
+        if columns.ncols() <= COMMON / 2 {
+            self.update_by_gain(columns, residual);
         } else {
-            self.update_by_information(rows, residual);
+            self.update_by_information(columns, residual);
         }
         symmetrise(&mut self.covariance);
     }
 
-    /// Few rows: the Kalman gain.
-    fn update_by_rows(&mut self, rows: &DMatrix<f64>, residual: &DVector<f64>) {
-        let lever = &self.covariance * rows.transpose();
-        let mut spread = rows * &lever;
-        for i in 0..rows.nrows() {
+    /// Few: the Kalman gain.
+    fn update_by_gain(&mut self, columns: &DMatrix<f64>, residual: &DVector<f64>) {
+        let lever = &self.covariance * columns;
+        let mut spread = columns.transpose() * &lever;
+        for i in 0..columns.ncols() {
             spread[(i, i)] += 1.0;
         }
         symmetrise(&mut spread);
@@ -240,28 +239,29 @@ impl Common {
             return;
         };
         self.mean += &lever * factor.solve(residual);
-        self.covariance.gemm_tr(-1.0, &whitened, &whitened, 1.0);
+        self.covariance -= whitened.transpose() * &whitened;
     }
 
-    /// Many rows: summed up, then one solve. With `P = C C'`, the new covariance is
+    /// Many: summed up, then one solve. With `P = C C'`, the new covariance is
     /// `C (I + C' L C)^-1 C'`, which stays non-negative.
-    fn update_by_information(&mut self, rows: &DMatrix<f64>, residual: &DVector<f64>) {
+    fn update_by_information(&mut self, columns: &DMatrix<f64>, residual: &DVector<f64>) {
         let Some(root) = self.covariance.clone().cholesky().map(|factor| factor.l()) else {
             return;
         };
-        let turned = rows * &root;
-        let mut information = turned.transpose() * &turned;
+        let told = columns * columns.transpose();
+        let mut information = root.transpose() * told * &root;
         for i in 0..COMMON {
             information[(i, i)] += 1.0;
         }
+        symmetrise(&mut information);
         let Some(factor) = information.cholesky() else {
             return;
         };
         let Some(whitened) = factor.l().solve_lower_triangular(&root.transpose()) else {
             return;
         };
-        let pull = &root * factor.solve(&(turned.transpose() * residual));
-        self.mean += pull;
+        let pull = root.transpose() * (columns * residual);
+        self.mean += &root * factor.solve(&pull);
         self.covariance = whitened.transpose() * &whitened;
     }
 }

@@ -18,6 +18,7 @@ pub struct Estimate {
     covariance: Matrix3<f64>,
     /// When the covariance was last read off; it never grows while a fire is not seen.
     read_at: Option<ServiceTime>,
+    reads: u32,
     methods: BTreeSet<Method>,
     first_sight: Vector3<f64>,
     first_at: ServiceTime,
@@ -35,7 +36,8 @@ struct GroundTaken {
 /// A sighting linearised, and what it says of the common errors.
 #[derive(Debug, Clone)]
 pub struct Taken {
-    measurement: Measurement,
+    /// Linearised.
+    pub measurement: Measurement,
     /// What it says of the common errors.
     pub told: Told,
     ground: Option<GroundTaken>,
@@ -52,8 +54,10 @@ const GROUND_MOVED: f64 = 1.0;
 const GROUND_REACH: f64 = 0.7;
 /// Inverse depth before anything is known: 10 m, to infinity at one sigma, 1/m.
 const INVERSE_DEPTH: (f64, f64) = (0.1, 0.1);
-/// Seconds after which the covariance of a fire that is not seen is read off again.
-const READ_AGAIN_S: f64 = 1.0;
+/// Times that a covariance is read off at every sighting.
+const YOUNG_READS: u32 = 40;
+/// Seconds after which it is read off again: when the fire is seen, and when it is not.
+const READ_S: (f64, f64) = (0.3, 1.0);
 
 impl Estimate {
     /// Nothing known but the pixel: inverse depth as unknown as it can be, or within what stereo
@@ -72,6 +76,7 @@ impl Estimate {
             position_m: *lens.centre(),
             covariance: Matrix3::zeros(),
             read_at: None,
+            reads: 0,
             methods: BTreeSet::new(),
             first_sight: ray,
             first_at: sighting.at,
@@ -121,21 +126,22 @@ impl Estimate {
     }
 
     /// Follows what was learned of the common errors. The covariance is read off when the fire was
-    /// just seen, and now and then otherwise: it does not grow while nothing is learned of a fire.
+    /// just seen, and now and then otherwise or once it has settled: it only shrinks, so an older one is
+    /// never too small.
     pub fn read_off(&mut self, common: &Common, now: ServiceTime, is_seen: bool) {
         self.state = self.block.state(common);
         self.position_m = self.block.chart().position(&self.state);
-        let is_old = self
+        let since_s = self
             .read_at
-            .is_none_or(|at| (now - at).as_secs_f64() >= READ_AGAIN_S);
-        if !is_seen && !is_old {
-            return;
+            .map_or(f64::INFINITY, |at| (now - at).as_secs_f64());
+        let is_young = is_seen && self.reads < YOUNG_READS;
+        let limit_s = if is_seen { READ_S.0 } else { READ_S.1 };
+        if is_young || since_s >= limit_s {
+            let common = common.covariance();
+            self.covariance = self.block.position_covariance(&self.state, common);
+            self.read_at = Some(now);
+            self.reads = self.reads.saturating_add(1);
         }
-        let of_state = self.block.covariance(common.covariance());
-        let by_state = self.block.chart().position_by_state(&self.state);
-        let position = by_state * of_state * by_state.transpose();
-        self.covariance = (position + position.transpose()) * 0.5;
-        self.read_at = Some(now);
     }
 
     /// Linearises a sighting about what is known now; nothing changes yet. A new fire is looked for

@@ -24,6 +24,8 @@ pub struct Glimpse {
 /// Chi-square 99.9 % for two and three numbers: bearing, and disparity. A fire is sighted hundreds
 /// of times; at 99 % each orbit would throw some of its own sightings away.
 const GATE: [f64; 2] = [13.82, 16.27];
+/// Squared distance up to which a sighting is no new fire while the fire there is not seen.
+const STRAY: f64 = 64.0;
 /// What a sighting costs that is given to no fire: the squared distance at which a new fire is as
 /// likely, given that one in a hundred looks shows a new one somewhere in a million pixels.
 const ALONE: f64 = 26.0;
@@ -86,7 +88,17 @@ fn add_common_spread(glimpses: &mut [Glimpse], rows: &[SMatrix<f64, 3, COMMON>],
     }
 }
 
-/// For each sighting the index of its fire, all at once at the least total cost.
+/// Which fire each sighting was given to.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Matches {
+    /// For each sighting the index of its fire.
+    pub slots: Vec<Option<usize>>,
+    /// For each sighting without one a fire that was not seen otherwise and that it may well belong to:
+    /// two boxes that became one, a box cut by a branch.
+    pub strays: Vec<Option<usize>>,
+}
+
+/// All at once at the least total cost.
 #[must_use]
 pub fn associate(
     glimpses: &[Glimpse],
@@ -94,49 +106,74 @@ pub fn associate(
     sightings: &[Classified],
     lens: &Lens,
     view: &View<'_>,
-) -> Vec<Option<usize>> {
+) -> Matches {
     let mut rows = vec![Vec::new(); sightings.len()];
+    let mut near_misses = Vec::new();
     let mut by_column: Vec<usize> = (0..sightings.len()).collect();
     let column = |index: &usize| sightings[*index].sighting.base.u;
     by_column.sort_by(|a, b| column(a).total_cmp(&column(b)));
     let coarsest = |of: fn(&Classified) -> f64| sightings.iter().map(of).fold(0.0, f64::max);
     let widest = coarsest(|classified| classified.sighting.base_sigma_px.0);
-    for (column_of, glimpse) in glimpses.iter().enumerate() {
-        let reach = (GATE[1] * (glimpse.spread[(0, 0)] + widest * widest)).sqrt();
+    for (of, glimpse) in glimpses.iter().enumerate() {
+        let reach = (STRAY * (glimpse.spread[(0, 0)] + widest * widest)).sqrt();
         let from = by_column.partition_point(|index| column(index) < glimpse.seen.x - reach);
         let near = by_column[from..]
             .iter()
             .take_while(|index| column(index) <= glimpse.seen.x + reach);
         for index in near {
             let fire = &fires[glimpse.slot];
-            let cost = match_cost(glimpse, fire, &sightings[*index], lens, view);
-            rows[*index].extend(cost.map(|cost| Candidate {
-                column: column_of,
-                cost,
-            }));
+            match fit(glimpse, fire, &sightings[*index], lens, view) {
+                Fit::Within { cost } => rows[*index].push(Candidate { column: of, cost }),
+                Fit::Stray => near_misses.push((*index, of)),
+                Fit::Not => {}
+            }
         }
     }
     let matched = assign(&rows, glimpses.len(), ALONE);
-    let slot = |column: Option<usize>| column.map(|column| glimpses[column].slot);
-    matched.into_iter().map(slot).collect()
+    let mut is_taken = vec![false; glimpses.len()];
+    matched.iter().flatten().for_each(|of| is_taken[*of] = true);
+    let mut strays = vec![None; sightings.len()];
+    let within = rows.iter().enumerate();
+    let within = within.flat_map(|(index, row)| row.iter().map(move |c| (index, c.column)));
+    for (index, of) in within.chain(near_misses) {
+        if !is_taken[of] {
+            strays[index] = Some(glimpses[of].slot);
+        }
+    }
+    let slot = |of: Option<usize>| of.map(|of| glimpses[of].slot);
+    Matches {
+        slots: matched.into_iter().map(slot).collect(),
+        strays,
+    }
 }
 
-/// What it costs to give a sighting to a fire; `None` beyond the gate.
-fn match_cost(
+/// How a sighting fits a fire.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Fit {
+    /// Within the gate, at a cost.
+    Within {
+        /// Squared distance, and how vague the fire is.
+        cost: f64,
+    },
+    /// Beyond the gate, but too near for another fire to begin there while this one is not seen.
+    Stray,
+    /// Elsewhere.
+    Not,
+}
+
+fn fit(
     glimpse: &Glimpse,
     fire: &Fire,
     classified: &Classified,
     lens: &Lens,
     view: &View<'_>,
-) -> Option<f64> {
-    if fire.class != classified.class {
-        return None;
-    }
+) -> Fit {
     let sighting = &classified.sighting;
     let (sigma_u, sigma_v) = sighting.base_sigma_px;
     let row = sighting.base.v - glimpse.seen.y;
-    if row * row > GATE[1] * (glimpse.spread[(1, 1)] + sigma_v * sigma_v) {
-        return None;
+    let is_far = row * row > STRAY * (glimpse.spread[(1, 1)] + sigma_v * sigma_v);
+    if is_far || fire.class != classified.class {
+        return Fit::Not;
     }
     let look = Look {
         sighting,
@@ -145,21 +182,31 @@ fn match_cost(
         ground: None,
         flown_share: 1.0,
     };
-    let m = look.linearise(fire.estimate.block().chart(), fire.estimate.state())?;
-    let has_disparity = m.by_state.row(MEASURED - 2).iter().any(|by| *by != 0.0);
-    let numbers = if has_disparity { 3 } else { 2 };
+    let estimate = &fire.estimate;
+    let Some(m) = look.linearise(estimate.block().chart(), estimate.state()) else {
+        return Fit::Not;
+    };
+    let has_disparity = m.says(MEASURED - 2);
+    let gate = GATE[usize::from(has_disparity)];
     let mut spread = glimpse.spread;
     let noise = Vector3::new(sigma_u * sigma_u, sigma_v * sigma_v, m.noise[2]);
     if !has_disparity {
         spread.fixed_view_mut::<1, 3>(2, 0).fill(0.0);
         spread.fixed_view_mut::<3, 1>(0, 2).fill(0.0);
     }
-    let factor = (spread + Matrix3::from_diagonal(&noise)).cholesky()?;
+    let Some(factor) = (spread + Matrix3::from_diagonal(&noise)).cholesky() else {
+        return Fit::Not;
+    };
     let residual = m.residual.fixed_rows::<3>(0).into_owned();
     let squared = residual.dot(&factor.solve(&residual));
-    if squared > GATE[numbers - 2] {
-        return None;
+    if squared > STRAY {
+        return Fit::Not;
+    }
+    if squared > gate {
+        return Fit::Stray;
     }
     let widening = 2.0 * factor.l().diagonal().map(f64::ln).sum() - noise.map(f64::ln).sum();
-    Some(squared + widening.min(MOST_WIDENING))
+    Fit::Within {
+        cost: squared + widening.min(MOST_WIDENING),
+    }
 }

@@ -106,6 +106,7 @@ pub struct Fire {
     /// Number of the fire that this one turned out to be, if it did.
     pub merged_into: Option<FireId>,
     furthest_m: f64,
+    strays: u8,
 }
 
 impl Fire {
@@ -179,6 +180,8 @@ const MISS_REACH: f64 = 1.1;
 /// How far the clock error's spread is looked over, in its sigmas and at most, seconds.
 const CLOCK_SIGMAS: f64 = 1.75;
 const LOOK_AHEAD_S: f64 = 0.6;
+/// Sightings in a row that may stray from a fire before another one begins there.
+const STRAYS: u8 = 8;
 /// Smoke this close to a fire's pixel, in its own sizes, is that fire's smoke.
 const SMOKE_REACH: f64 = 0.6;
 
@@ -232,9 +235,11 @@ impl Tracker {
         self.age(view);
         let lens = self.lens(view);
         let glimpses = glimpse::all(&self.fires, &self.common, &lens, view.rig);
-        let slots = glimpse::associate(&glimpses, &self.fires, sightings, &lens, view);
+        let matches = glimpse::associate(&glimpses, &self.fires, sightings, &lens, view);
+        let slots = matches.slots;
         self.update(&slots, sightings, &lens, view, terrain);
-        let new = self.initiate(&slots, sightings, view, terrain);
+        let strays = self.tolerated(&slots, &matches.strays);
+        let new = self.initiate(&slots, &strays, sightings, view, terrain);
         let seen: BTreeSet<usize> = slots.iter().chain(&new).copied().flatten().collect();
         for (slot, fire) in self.fires.iter_mut().enumerate() {
             fire.estimate
@@ -291,19 +296,40 @@ impl Tracker {
 
     fn absorb(&mut self, taken: &[(usize, Taken)], lens: &Lens) {
         let mean = self.common.mean().clone();
-        let (rows, residual) = stacked(taken);
+        let (columns, residual) = stacked(taken);
         for (slot, taken) in taken {
             self.fires[*slot]
                 .estimate
                 .learn(taken, &mean, lens.centre());
         }
-        self.common.update(&rows, &residual);
+        self.common.update(&columns, &residual);
+    }
+
+    /// Which sightings are put down to a fire that they stray from: a few in a row, and no more, lest a
+    /// fire that is placed wrongly keeps the true place from being found.
+    fn tolerated(&mut self, slots: &[Option<usize>], strays: &[Option<usize>]) -> Vec<bool> {
+        for slot in slots.iter().flatten() {
+            self.fires[*slot].strays = 0;
+        }
+        let tolerates = |fire: &mut Fire| {
+            fire.strays = fire.strays.saturating_add(1);
+            fire.strays <= STRAYS
+        };
+        strays
+            .iter()
+            .zip(slots)
+            .map(|(stray, slot)| match (stray, slot) {
+                (Some(stray), None) => tolerates(&mut self.fires[*stray]),
+                _ => false,
+            })
+            .collect()
     }
 
     /// Sightings that no fire and no other sighting explains begin a fire each.
     fn initiate(
         &mut self,
         slots: &[Option<usize>],
+        strays: &[bool],
         sightings: &[Classified],
         view: &View<'_>,
         terrain: Option<&dyn Terrain>,
@@ -316,6 +342,7 @@ impl Tracker {
         let mut all_taken = Vec::new();
         for (index, classified) in sightings.iter().enumerate() {
             let is_free = slots[index].is_none()
+                && !strays[index]
                 && self.fires.len() < MAX_FIRES
                 && !self.is_explained(&lens, sightings, index, slots);
             if !is_free {
@@ -362,6 +389,7 @@ impl Tracker {
             flicker: crate::assess::Flicker::default(),
             merged_into: None,
             furthest_m: 0.0,
+            strays: 0,
         };
         Some((fire, taken))
     }
@@ -500,19 +528,31 @@ impl Tracker {
     }
 }
 
-/// All rows that say something of the common errors, each with unit noise.
+/// All rows that say something of the common errors, each with unit noise, as columns.
 fn stacked(taken: &[(usize, Taken)]) -> (DMatrix<f64>, DVector<f64>) {
-    let mut rows = DMatrix::zeros(taken.len() * block::MEASURED, COMMON);
-    let mut residual = DVector::zeros(taken.len() * block::MEASURED);
-    for (index, (_, taken)) in taken.iter().enumerate() {
-        let (from, told) = (index * block::MEASURED, &taken.told);
-        rows.fixed_rows_mut::<{ block::MEASURED }>(from)
-            .copy_from(&(told.whitener * told.rows));
-        residual
-            .fixed_rows_mut::<{ block::MEASURED }>(from)
-            .copy_from(&(told.whitener * told.residual));
+    let says = |taken: &Taken| {
+        (0..block::MEASURED)
+            .filter(|row| taken.measurement.says(*row))
+            .count()
+    };
+    let count = taken.iter().map(|(_, taken)| says(taken)).sum();
+    let mut columns = DMatrix::zeros(COMMON, count);
+    let mut residual = DVector::zeros(count);
+    let mut next = 0;
+    for (_, taken) in taken {
+        let told = &taken.told;
+        let rows = told.whitener * told.rows;
+        let left = told.whitener * told.residual;
+        for row in (0..block::MEASURED).filter(|row| taken.measurement.says(*row)) {
+            let to = columns.column_mut(next);
+            to.into_iter()
+                .zip(rows.row(row).iter())
+                .for_each(|(to, from)| *to = *from);
+            residual[next] = left[row];
+            next += 1;
+        }
     }
-    (rows, residual)
+    (columns, residual)
 }
 
 /// Suspected to confirmed, and back from out, by what was seen.

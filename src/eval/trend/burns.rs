@@ -330,15 +330,17 @@ fn wander(sigma: f64, correlation_s: f64, rng: &mut ChaCha8Rng) -> Vec<f64> {
 /// Starts and lengths, seconds, of what comes at a rate.
 fn spells(rate: f64, length_s: Span, rng: &mut ChaCha8Rng) -> Vec<(f64, f64)> {
     let mut spells = Vec::new();
+    if rate <= 0.0 {
+        return spells;
+    }
     let mut at_s = 0.0;
-    while rate > 0.0 {
+    loop {
         at_s -= (1.0 - rng.random::<f64>()).ln() / rate;
         if at_s > (SCORED + LEAD) as f64 * STEP_S {
-            break;
+            return spells;
         }
         spells.push((at_s, draw(length_s, rng)));
     }
-    spells
 }
 
 fn draw((low, high): Span, rng: &mut ChaCha8Rng) -> f64 {

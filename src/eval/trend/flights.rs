@@ -154,7 +154,7 @@ impl Scene {
         let range_m = 10.0 * 10_f64.powf(draw(0.0, 1.0));
         let width_m = (range_m * draw(0.02, 0.06)).max(0.3);
         let height_m = width_m * draw(0.8, 1.6);
-        let runs = flight % 3 != 0;
+        let runs = !flight.is_multiple_of(3);
         let azimuth_deg = draw(0.0, 360.0);
         let speed_m_s = range_m / FLIGHT_S * draw(0.08, 0.3);
         let wind_m_s = draw(0.5, 5.0);
@@ -198,7 +198,7 @@ impl Scene {
         };
         let side = if draw(0.0, 1.0) < 0.5 { 1.0 } else { -1.0 };
         let turn = side
-            * if flight % 4 == 0 {
+            * if flight.is_multiple_of(4) {
                 draw(0.0, 0.01)
             } else {
                 draw(0.03, 0.12)
