@@ -56,6 +56,7 @@ fn camera() -> CameraSeen {
         pairs: (0..24).map(pair).collect(),
         left: vec![eye(120.0, 0.2); 8],
         right: vec![eye(118.0, 0.19); 8],
+        rows_px: vec![0.1; 8],
         ..CameraSeen::default()
     }
 }
@@ -209,6 +210,20 @@ fn a_black_a_dark_and_a_blurred_eye_are_named() {
     let alike = named(&alike, "eyes alike");
     assert_eq!(alike.verdict, Verdict::Warn);
     assert!(alike.remedy.contains("right eye"), "{alike:?}");
+}
+
+#[test]
+fn a_bent_rig_is_seen_on_the_ground() {
+    let bent = |rows: f64| {
+        let seen = CameraSeen {
+            rows_px: vec![rows; 8],
+            ..camera()
+        };
+        named(&judged(&seen), "eyes level").verdict
+    };
+    assert_eq!(bent(-0.2), Verdict::Pass);
+    assert_eq!(bent(0.9), Verdict::Warn);
+    assert_eq!(bent(-3.0), Verdict::Fail);
 }
 
 #[test]

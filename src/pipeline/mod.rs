@@ -12,9 +12,11 @@
 mod counters;
 mod feature;
 mod light;
+mod selfcheck;
 mod vision;
 
 pub use counters::Counters;
+pub use selfcheck::{Fault, SelfCheck};
 pub use vision::{Seen, Vision};
 
 use crate::alarm::{Alarm, AlarmDesk, Area, FireId, Situation};
@@ -22,12 +24,12 @@ use crate::assess::extent::{Extent, Wind};
 use crate::assess::watch::{Assessment, Assessor, Light};
 use crate::detect::{Detection, Detector};
 use crate::ingest::StereoPair;
-use crate::locate::{Ground, SharedPriors, Terrain, View, fix};
+use crate::locate::{Ground, SharedPriors, Terrain, TerrainHit, View, fix, meet_terrain};
 use crate::mission::Mission;
 use crate::pose::{Pose, PoseAnswer, PoseEstimator};
 use crate::range::Ranger;
-use crate::track::{Classified, Fire, Outcome, Tracker};
-use emberfix_calib::Rig;
+use crate::track::{Classified, Estimated, Fire, Outcome, Tracker};
+use emberfix_calib::{RectifiedPixel, Rig};
 use emberfix_frames::{
     Coordinate, GeoidUndulation, Metres, MissionEnu, ServiceTime, SignedDuration, Stamped,
     TimeSyncSample, Vector3, Wgs84, Wgs84Parts, ecef_from_enu, place_from_ecef, seconds,
@@ -73,6 +75,17 @@ pub enum Output {
 pub struct Health {
     /// What is wrong, in words; empty when all is well.
     pub problems: Vec<String>,
+    /// What makes positions worse, and keeps none back: in words for the operator.
+    pub warnings: Vec<&'static str>,
+}
+
+impl Health {
+    /// All of it, in words.
+    #[must_use]
+    pub fn words(&self) -> Vec<String> {
+        let warnings = self.warnings.iter().map(|warning| (*warning).to_owned());
+        self.problems.iter().cloned().chain(warnings).collect()
+    }
 }
 
 /// The loop's state.
@@ -82,6 +95,7 @@ pub struct Pipeline {
     terrain: Option<Arc<dyn Terrain>>,
     shared: SharedPriors,
     vision: Vision,
+    check: SelfCheck,
     poses: PoseEstimator,
     tracker: Tracker,
     assessor: Assessor,
@@ -129,6 +143,7 @@ impl Pipeline {
             terrain: mission.terrain.clone(),
             shared: mission.shared,
             vision: Vision::new(&mission.rig, detector, ranger),
+            check: SelfCheck::new(mission.rig.sigmas().disparity_bias_px),
             poses: PoseEstimator::new(mission.pose),
             tracker: Tracker::new(mission.track, first_fire),
             assessor: Assessor::default(),
@@ -192,7 +207,9 @@ impl Pipeline {
             problems.push("no stereo pairs".to_owned());
         }
         problems.extend(self.blind.clone());
-        Health { problems }
+        let faults = self.check.faults().iter();
+        let warnings = faults.map(|fault| fault.words()).collect();
+        Health { problems, warnings }
     }
 
     fn take_mavlink(&mut self, received: &Received) {
@@ -383,12 +400,16 @@ impl Pipeline {
         if seen.mono {
             self.degraded.push(crate::pose::Degraded::Mono.name());
         }
+        self.compare_eyes(&seen, &view);
+        let faults = self.check.faults().iter();
+        self.degraded.extend(faults.map(|fault| fault.name()));
         let sightings: Vec<_> = seen
             .sightings
             .iter()
-            .map(|(_, sighting)| *sighting)
+            .map(|(_, sighting)| self.widened(*sighting))
             .collect();
         let outcomes = self.track(&view, &sightings);
+        self.note_estimate();
         self.assess(pair, &seen, &outcomes, &view);
         let mut outputs = vec![Output::Pose(Box::new(pose.clone()))];
         for outcome in &outcomes {
@@ -400,6 +421,36 @@ impl Pipeline {
         });
         outputs.extend(self.alarms(&view));
         outputs
+    }
+
+    /// Both eyes against each other and against the terrain, where this pair was compared.
+    fn compare_eyes(&mut self, seen: &Seen, view: &View<'_>) {
+        let Some(compared) = &seen.eyes else {
+            return;
+        };
+        self.counters.add("self_check", "compared");
+        let terrain = self.terrain.as_deref();
+        self.check
+            .note(compared, |pixel| promised(pixel, view, terrain));
+    }
+
+    /// A disparity of a rig that is not what its file says tells less.
+    fn widened(&self, mut classified: Classified) -> Classified {
+        if let Some(disparity) = &mut classified.sighting.disparity {
+            disparity.sigma_px = self.check.widened(disparity.sigma_px);
+        }
+        classified
+    }
+
+    /// The disparity offset that flying past fires has shown, once it has.
+    fn note_estimate(&mut self) {
+        let told = self
+            .tracker
+            .shared_errors()
+            .map(|shared| shared.disparity_px);
+        let found = told.filter(Estimated::is_found);
+        self.check
+            .note_estimate(found.map(|found| (found.value, found.sigma)));
     }
 
     /// The tracker may ask where the vehicle was at other moments: the clock error is one of its states.
@@ -534,6 +585,18 @@ impl AutopilotLock {
     fn is(self, sender: Address) -> bool {
         self.system == Some(sender.system)
             && sender.component == emberfix_mav::ComponentId::AUTOPILOT
+    }
+}
+
+/// Disparity of the ground behind a pixel of the rectified left image.
+fn promised(pixel: RectifiedPixel, view: &View<'_>, terrain: Option<&dyn Terrain>) -> Option<f64> {
+    let ray = view.ray_enu(pixel);
+    match meet_terrain(&view.camera_enu, &ray, terrain?, view) {
+        TerrainHit::Met { range_m, .. } => {
+            let depth_m = view.enu_from_cam.column(2).dot(&ray) * range_m;
+            (depth_m > 0.0).then(|| view.rig.disparity_px(depth_m))
+        }
+        _ => None,
     }
 }
 

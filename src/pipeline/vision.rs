@@ -6,10 +6,10 @@ use crate::assess::PLAIN_LEVEL;
 use crate::detect::{BoxPx, Detection, DetectionClass, Detector, LeftImage};
 use crate::ingest::{EncodedImage, EyeHealth, EyeWatch, ImageDecoder, StereoPair};
 use crate::locate::{DisparityOf, Sighting};
-use crate::range::{Disparity, Ranger, Ranging, RawPair, Target};
+use crate::range::{Disparity, EyeComparer, EyesCompared, Ranger, Ranging, RawPair, Target};
 use crate::track::Classified;
 use emberfix_calib::{Eye, RawPixel, RectifiedPixel, Rig};
-use emberfix_frames::Stamped;
+use emberfix_frames::{ServiceTime, SignedDuration, Stamped};
 use opencv::core::{Mat, MatTraitConst};
 use opencv::prelude::MatTraitConstManual;
 use std::sync::Arc;
@@ -25,6 +25,8 @@ pub struct Seen {
     pub flames: Vec<Option<f64>>,
     /// True when the right eye was of no use.
     pub mono: bool,
+    /// Both eyes against each other; once in [`COMPARE_EVERY`].
+    pub eyes: Option<EyesCompared>,
 }
 
 /// Decoder, detector and ranger of one rig.
@@ -35,8 +37,13 @@ pub struct Vision {
     right_watch: EyeWatch,
     detector: Box<dyn Detector>,
     ranger: Box<dyn Ranger>,
+    comparer: Option<EyeComparer>,
+    compared: Option<ServiceTime>,
 }
 
+/// How often the eyes are compared: often enough to tell a crew, seldom enough to cost nothing; a hair
+/// under a second, so that each pair of a camera of one a second is.
+pub const COMPARE_EVERY: SignedDuration = SignedDuration::from_millis(900);
 /// Margin about a box for its light, as a share of the box: box edges jitter, light must not.
 const GLOW_MARGIN: f64 = 0.25;
 /// Jitter of a box's edges: pixels at least, and as a share of the box. A bed of embers has a radius of a
@@ -55,6 +62,9 @@ impl Vision {
             right_watch: EyeWatch::default(),
             detector,
             ranger,
+            // A rig that was rectified to be checked has maps.
+            comparer: EyeComparer::new(rig).ok(),
+            compared: None,
         }
     }
 
@@ -94,11 +104,30 @@ impl Vision {
             .map(|(index, _)| light::flame(&raw.left_bgr, &boxes[*index], scene?))
             .collect();
         Some(Seen {
+            eyes: self.compare(&raw, counters),
             flames,
             found,
             sightings,
             mono: raw.right_gray.is_none(),
         })
+    }
+
+    fn compare(&mut self, pair: &RawPair, counters: &mut Counters) -> Option<EyesCompared> {
+        let due = self
+            .compared
+            .is_none_or(|last| pair.at - last >= COMPARE_EVERY);
+        if !due || pair.right_gray.is_none() {
+            return None;
+        }
+        self.compared = Some(pair.at);
+        match self.comparer.as_ref()?.compare(pair) {
+            Ok(compared) => Some(compared),
+            Err(error) => {
+                counters.add("self_check", "failed");
+                tracing::warn!(%error, "eyes not compared");
+                None
+            }
+        }
     }
 
     fn left(&mut self, image: &EncodedImage, counters: &mut Counters) -> Option<Mat> {

@@ -20,6 +20,7 @@ mod centroid;
 mod config;
 mod correlate;
 mod cross_spectral;
+mod eyes;
 mod mask;
 mod patch;
 mod pool;
@@ -33,6 +34,7 @@ mod tests;
 mod ways;
 
 pub use config::{Method, Methods, RangeConfig};
+pub use eyes::{EyeComparer, EyesCompared, SamePlace};
 pub use mask::HsvMask;
 
 use crate::detect::{BoxPx, DetectionClass};

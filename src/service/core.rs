@@ -125,7 +125,7 @@ impl Core {
 
     fn hand_on_pose(&mut self, pose: &Pose) {
         let heading_deg = pose.attitude.angles().2.to_degrees().rem_euclid(360.0);
-        let health = self.pipeline.health(self.pipeline.now()).problems;
+        let health = self.pipeline.health(self.pipeline.now()).words();
         self.board.latest().ping = Some(Ping {
             uav: self.uav.clone(),
             at: pose.at,
@@ -188,7 +188,10 @@ impl Core {
             for problem in &health.problems {
                 tracing::warn!(problem, "not healthy");
             }
-            if health.problems.is_empty() {
+            for warning in &health.warnings {
+                tracing::warn!(warning, "positions are worse than they could be");
+            }
+            if health.problems.is_empty() && health.warnings.is_empty() {
                 tracing::info!("healthy");
             }
         }

@@ -7,7 +7,10 @@ use crate::deliver::mavlink::{MavlinkDelivery, MavlinkSettings};
 use crate::ingest::ServiceClock;
 use crate::mission::Mission;
 use emberfix_frames::{ServiceTime, SignedDuration};
-use emberfix_mav::outgoing::{companion_heartbeat, set_message_interval, timesync_request};
+use emberfix_mav::outgoing::{
+    companion_heartbeat, set_message_interval, status_text, timesync_request,
+};
+use emberfix_mav::telemetry::{Severity, StatusText};
 use emberfix_mav::{
     Address, Chunk, ComponentId, Encoder, FrameReader, Link, MavMessage, Peer, Received, SystemId,
     Telemetry, message_name,
@@ -60,6 +63,8 @@ pub struct Talk {
     outbox_due: ServiceTime,
     /// Alarms that can't be told this way, so that each is complained of once.
     refused: BTreeMap<String, u32>,
+    /// What the operator was told last.
+    warned: Vec<&'static str>,
 }
 
 impl Talk {
@@ -90,6 +95,7 @@ impl Talk {
             rates_due: now,
             outbox_due: now,
             refused: BTreeMap::new(),
+            warned: Vec::new(),
         }
     }
 
@@ -218,6 +224,7 @@ impl Talk {
             if self.board.is_healthy() {
                 self.send(&companion_heartbeat(true)).await;
             }
+            self.tell_warnings().await;
         }
         if now >= self.timesync_due {
             self.timesync_due = now + TIMESYNC;
@@ -233,6 +240,23 @@ impl Talk {
             self.check_rates(autopilot).await;
         }
         self.tell_alarms(now).await;
+    }
+
+    /// Tells the operator of each warning when it comes up, once.
+    async fn tell_warnings(&mut self) {
+        let warnings = self.board.latest().health.warnings.clone();
+        let news: Vec<_> = warnings
+            .iter()
+            .filter(|warning| !self.warned.contains(warning))
+            .map(|warning| StatusText {
+                severity: Severity::Warning,
+                text: (*warning).to_owned(),
+            })
+            .collect();
+        self.warned = warnings;
+        for text in &news {
+            self.send(&status_text(text)).await;
+        }
     }
 
     async fn check_rates(&mut self, autopilot: Address) {

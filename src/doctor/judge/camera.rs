@@ -1,6 +1,6 @@
 //! The camera: do both eyes deliver, in step, fresh, and do they see.
 
-use super::{AtLeast, median};
+use super::{AtLeast, AtMost, median};
 use crate::doctor::probe::camera::{CameraSeen, EyeSeen};
 use crate::doctor::{Finding, Section, Verdict};
 use crate::ingest::{CaptureClock, EyeHealth};
@@ -31,6 +31,11 @@ const BURNT: f64 = 0.35;
 const GAIN_RATIO: f64 = 1.6;
 /// Edges of the eyes may differ by this factor before one is out of focus or dirty.
 const SHARPNESS_RATIO: f64 = 1.7;
+/// Rows between the eyes, pixels. Calibration leaves 0.3; beyond 2 nothing matches.
+const ROWS_PX: AtMost = AtMost {
+    good: 0.5,
+    usable: 2.0,
+};
 /// Edges (Laplacian over mean level) below which a picture of the outdoors is a blur.
 const BLUR: f64 = 0.02;
 
@@ -87,6 +92,7 @@ fn present(seen: &CameraSeen, rig: &Rig) -> Vec<Finding> {
     findings.extend(eye("left eye", &seen.left));
     findings.extend(eye("right eye", &seen.right));
     findings.extend(alike(&seen.left, &seen.right));
+    findings.extend(rows(&seen.rows_px));
     findings
 }
 
@@ -259,6 +265,21 @@ fn eye(name: &'static str, looks: &[EyeSeen]) -> Option<Finding> {
     } else {
         Finding::pass(name, value)
     })
+}
+
+/// Whether the rig is still the one that was calibrated: places are on equal rows in both eyes.
+fn rows(rows_px: &[f64]) -> Option<Finding> {
+    let off_px = median(rows_px.iter().copied())?;
+    let value = format!("the same places are {off_px:+.2} rows apart in the two eyes");
+    let remedy = "the rig is bent since it was calibrated, or this is another one: emberfix calibrate stereo";
+    let figure = Figure::bounded(
+        "doctor.rows_apart_px",
+        Some(off_px.abs()),
+        "px",
+        Bound::AtMost(ROWS_PX.usable),
+        rows_px.len(),
+    );
+    Some(Finding::of(ROWS_PX.judge(off_px.abs()), "eyes level", value, remedy).with(figure))
 }
 
 /// Both eyes against each other: what one sees well, the other should.

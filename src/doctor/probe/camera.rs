@@ -1,10 +1,12 @@
 //! The camera: pairs as they come, and what some of them show.
 
+use crate::doctor::judge::median;
 use crate::ingest::{
     self, CameraUrl, CaptureClock, EncodedImage, EyeHealth, EyeWatch, ImageDecoder, SourceCounters,
     StereoPair, StereoSource,
 };
 use crate::mission::Mission;
+use crate::range::{EyeComparer, RawPair};
 use crate::service::service_clock;
 use emberfix_frames::{ServiceTime, Stamped};
 use opencv::core::{self, Mat, MatTraitConst, Scalar};
@@ -24,6 +26,8 @@ pub struct CameraSeen {
     pub left: Vec<EyeSeen>,
     /// Looks at right eyes, of the same pairs.
     pub right: Vec<EyeSeen>,
+    /// Rows between the eyes at places that both see, pixels; the median of each look at both.
+    pub rows_px: Vec<f64>,
     /// Pictures that can't be read: the first reason.
     pub unreadable: Option<String>,
     /// What the source counted.
@@ -58,6 +62,8 @@ pub struct EyeSeen {
 
 /// Pictures that are looked at per second: enough to judge by, few enough for a small computer.
 const LOOKS_PER_S: f64 = 2.0;
+/// Places that both eyes must see before their rows are compared.
+const ENOUGH_PLACES: usize = 8;
 /// Grey level from which a pixel is burnt out.
 const BURNT_LEVEL: f64 = 250.0;
 
@@ -142,6 +148,7 @@ fn pair_seen(pair: &Stamped<StereoPair>) -> PairSeen {
 
 struct Eyes {
     decoder: ImageDecoder,
+    comparer: Option<EyeComparer>,
     left: EyeWatch,
     right: EyeWatch,
 }
@@ -150,6 +157,7 @@ impl Eyes {
     fn new(mission: &Mission) -> Self {
         Self {
             decoder: ImageDecoder::new(&mission.rig),
+            comparer: EyeComparer::new(&mission.rig).ok(),
             left: EyeWatch::default(),
             right: EyeWatch::default(),
         }
@@ -159,26 +167,61 @@ impl Eyes {
         let left = self
             .decoder
             .left(&pair.left)
-            .map_err(|error| error.to_string())
-            .and_then(|bgr| in_numbers(&mut self.left, &pair.left, &bgr));
-        note(left, &mut seen.left, &mut seen.unreadable);
+            .map_err(|error| error.to_string());
+        let left = note(
+            left,
+            &mut self.left,
+            &pair.left,
+            &mut seen.left,
+            &mut seen.unreadable,
+        );
         let Some(image) = &pair.right else {
             return;
         };
-        let right = self
-            .decoder
-            .right(image)
-            .map_err(|error| error.to_string())
-            .and_then(|grey| in_numbers(&mut self.right, image, &grey));
-        note(right, &mut seen.right, &mut seen.unreadable);
+        let right = self.decoder.right(image).map_err(|error| error.to_string());
+        let right = note(
+            right,
+            &mut self.right,
+            image,
+            &mut seen.right,
+            &mut seen.unreadable,
+        );
+        if let (Some(left_bgr), Some(right_gray)) = (left, right) {
+            seen.rows_px.extend(self.rows(RawPair {
+                at: pair.left.at,
+                left_bgr,
+                right_gray: Some(right_gray),
+            }));
+        }
+    }
+
+    /// Rows between the eyes, where they see enough of the same.
+    fn rows(&self, pair: RawPair) -> Option<f64> {
+        let compared = self.comparer.as_ref()?.compare(&pair).ok()?;
+        let rows = compared.found.iter().map(|place| place.vertical_px);
+        (compared.found.len() >= ENOUGH_PLACES)
+            .then(|| median(rows))
+            .flatten()
     }
 }
 
-fn note(look: Result<EyeSeen, String>, into: &mut Vec<EyeSeen>, unreadable: &mut Option<String>) {
-    match look {
-        Ok(eye) => into.push(eye),
+/// Takes a picture in numbers down, and hands it back; the first that can't be read is told.
+fn note(
+    decoded: Result<Mat, String>,
+    watch: &mut EyeWatch,
+    image: &EncodedImage,
+    into: &mut Vec<EyeSeen>,
+    unreadable: &mut Option<String>,
+) -> Option<Mat> {
+    let looked = decoded.and_then(|pixels| Ok((in_numbers(watch, image, &pixels)?, pixels)));
+    match looked {
+        Ok((eye, pixels)) => {
+            into.push(eye);
+            Some(pixels)
+        }
         Err(reason) => {
             unreadable.get_or_insert(reason);
+            None
         }
     }
 }
