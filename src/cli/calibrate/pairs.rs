@@ -73,10 +73,17 @@ pub fn pair_up(files: &[PathBuf]) -> Vec<FilePair> {
         let mut by_rest: BTreeMap<String, (Option<PathBuf>, Option<PathBuf>)> = BTreeMap::new();
         for file in files {
             let text = file.to_string_lossy();
-            if let Some(rest) = without(&text, left) {
-                by_rest.entry(rest).or_default().0 = Some(file.clone());
-            } else if let Some(rest) = without(&text, right) {
-                by_rest.entry(rest).or_default().1 = Some(file.clone());
+            // What stands last in the path tells: a folder may be called left_right.
+            match (named_at(&text, left), named_at(&text, right)) {
+                (Some(at), other) if other.is_none_or(|other| other < at) => {
+                    let rest = without(&text, at, left);
+                    by_rest.entry(rest).or_default().0 = Some(file.clone());
+                }
+                (_, Some(at)) => {
+                    let rest = without(&text, at, right);
+                    by_rest.entry(rest).or_default().1 = Some(file.clone());
+                }
+                _ => {}
             }
         }
         let pairs: Vec<FilePair> = by_rest
@@ -97,12 +104,12 @@ pub fn pair_up(files: &[PathBuf]) -> Vec<FilePair> {
     Vec::new()
 }
 
-/// The path with the last place that names this eye taken out. A name counts where no letter touches
-/// it: `left01`, `img_L_3`, `cam0/`.
-fn without(path: &str, eye: &str) -> Option<String> {
+/// The last place of the path that names this eye. A name counts where no letter touches it: `left01`,
+/// `img_L_3`, `cam0/`.
+fn named_at(path: &str, eye: &str) -> Option<usize> {
     let lower = path.to_ascii_lowercase();
     let touches = |character: Option<char>| character.is_some_and(char::is_alphabetic);
-    let at = lower.rmatch_indices(eye).map(|(at, _)| at).find(|&at| {
+    lower.rmatch_indices(eye).map(|(at, _)| at).find(|&at| {
         let after = at + eye.len();
         // A digit after a digit is another number: cam0 is not in cam01.
         let more = eye.ends_with(|c: char| c.is_ascii_digit())
@@ -110,8 +117,12 @@ fn without(path: &str, eye: &str) -> Option<String> {
         !touches(lower[..at].chars().next_back())
             && !touches(lower[after..].chars().next())
             && !more
-    })?;
-    Some(format!("{}*{}", &path[..at], &path[at + eye.len()..]))
+    })
+}
+
+/// The path with the eye's name at a place taken out.
+fn without(path: &str, at: usize, eye: &str) -> String {
+    format!("{}*{}", &path[..at], &path[at + eye.len()..])
 }
 
 /// The part of a name that tells pairs apart, for people.
@@ -119,12 +130,14 @@ fn short(rest: &str) -> String {
     let path = Path::new(rest);
     let stem = path.file_stem().map(|stem| stem.to_string_lossy());
     let stem = stem.unwrap_or_default();
-    let trimmed = stem.trim_matches(|c: char| !c.is_alphanumeric());
-    if trimmed.is_empty() {
-        rest.to_owned()
-    } else {
-        trimmed.to_owned()
-    }
+    let pieces = stem
+        .split('*')
+        .map(|piece| piece.trim_matches(|c: char| !c.is_alphanumeric()));
+    // Numbers tell moments apart; `img` does not.
+    let numbered = |piece: &&str| piece.contains(|c: char| c.is_ascii_digit());
+    let all: Vec<&str> = pieces.filter(|piece| !piece.is_empty()).collect();
+    let told = all.iter().copied().rfind(numbered);
+    told.or(all.last().copied()).unwrap_or(rest).to_owned()
 }
 
 #[cfg(test)]
