@@ -433,7 +433,10 @@ fn one_alarm_stands_for_each_thing(alarms: &Path, found: &BTreeMap<String, Vec<P
         let own = sightings.iter().filter(|s| s.fire == fire).count();
         (strayed, all) = (strayed + sightings.len() - own, all + sightings.len());
         let Some(alarm) = alarms.iter().find(|alarm| alarm.fire == fire) else {
-            println!("{feature}: not told, {own} of {} sightings", sightings.len());
+            println!(
+                "{feature}: not told, {own} of {} sightings",
+                sightings.len()
+            );
             continue;
         };
         let off = alarm.enu_m - mean(sightings);
