@@ -123,7 +123,9 @@ impl Options {
     pub fn fly(&self, law: Law, count: usize, bar: &ProgressBar) -> Result<Vec<Flown>, SetupError> {
         self.each(&format!("{law:?}"), count, bar, |index, rng| {
             let beside = match law {
-                Law::Assumed if index / self.kinds.len() % AT_ONCE == 0 => Beside::AllAtOnce,
+                Law::Assumed if (index / self.kinds.len()).is_multiple_of(AT_ONCE) => {
+                    Beside::AllAtOnce
+                }
                 Law::Assumed => Beside::Bound,
                 _ => Beside::Nothing,
             };
