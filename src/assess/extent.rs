@@ -129,7 +129,7 @@ const RATE_PRIOR: f64 = 3.0;
 /// Slower than this nothing is told apart from standing still, m/s.
 const STANDING_M_S: f64 = 0.05;
 
-/// The looks at one fire. Bound: [`MOST_LOOKS`]; the oldest goes first.
+/// The looks at one fire. Bound: `MOST_LOOKS`; the oldest goes first.
 #[derive(Debug, Clone, Default)]
 pub struct Outline {
     looks: VecDeque<Look>,

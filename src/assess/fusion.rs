@@ -6,8 +6,8 @@
 //!
 //! **How.** A Kalman filter over level, rate, acceleration and each channel's own offset. Each
 //! channel's noise is estimated as it goes, from its clipped innovations, so that the quieter one
-//! weighs more (inverse local noise variance). A sample further off than [`OUTLIER`] sigmas is not
-//! used; when [`LASTING`] in a row are, the channel has jumped (exposure, smoke, dirt), not the fire:
+//! weighs more (inverse local noise variance). A sample further off than `OUTLIER` sigmas is not
+//! used; when `LASTING` in a row are, the channel has jumped (exposure, smoke, dirt), not the fire:
 //! its offset is set free, and its rate counts again from there. So a channel that goes missing,
 //! black or frozen hands over to the other one without a step.
 //!

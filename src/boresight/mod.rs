@@ -5,7 +5,7 @@
 //! place of the marker. **In:** [`Sight`]s (pixels of the raw left image, and the way that the airframe
 //! took about that moment, in the plane at the mission datum), a [`Start`] with the rig as it is and what
 //! is known beforehand. **Out:** a [`Solution`]: every parameter with its sigma, the covariance of all, and
-//! [`words`] that say what the flight could not show and what to fly instead. `solve`, `model` and `words`
+//! `words` that say what the flight could not show and what to fly instead. `solve`, `model` and `words`
 //! are pure; `flight` reads recordings, `rig_file` writes rigs.
 //!
 //! **Method.** Gauss-Newton with Levenberg's damping on the projection of the marker, Cauchy weights

@@ -25,7 +25,7 @@ pub struct Seen {
     pub flames: Vec<Option<f64>>,
     /// True when the right eye was of no use.
     pub mono: bool,
-    /// Both eyes against each other; once in [`COMPARE_EVERY`].
+    /// Both eyes against each other; once in `COMPARE_EVERY`.
     pub eyes: Option<EyesCompared>,
 }
 

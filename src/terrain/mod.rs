@@ -1,4 +1,4 @@
-//! Terrain tiles from disk into the pure [`Tiles`](crate::locate::Tiles).
+//! Terrain tiles from disk into the pure [`crate::locate::Tiles`].
 //!
 //! **In:** GeoTIFF files (SRTM, Copernicus, or the like: [`geotiff`]) and the area that matters.
 //! **Out:** checked tiles that hold the posts of that area only, so that memory is bounded by the
