@@ -107,7 +107,7 @@ const LEAST_LOOKS: usize = 6;
 /// fire and the speed of its head can't be told.
 const LEAST_OVAL_LOOKS: usize = 16;
 const LEAST_OVAL_S: f64 = 8.0;
-const LEAST_OVAL_DEG: f64 = 60.0;
+const LEAST_OVAL_DEG: f64 = 75.0;
 /// Seconds of looks that say how wide and how high it is now.
 const WIDTH_S: f64 = 10.0;
 const HEIGHT_S: f64 = 12.0;
@@ -120,8 +120,8 @@ const DEPTH_SIGMA: f64 = 0.4;
 const SURE: f64 = 3.0;
 const SURE_DEG: f64 = 20.0;
 /// Share of the speed, and degrees, that the oval itself is wrong by: fires are no ellipses.
-const SPEED_SHARE: f64 = 0.17;
-const DIRECTION_DEG: f64 = 6.0;
+const SPEED_SHARE: f64 = 0.2;
+const DIRECTION_DEG: f64 = 5.0;
 /// Share of the depth that it is wrong by for the same reason.
 const DEPTH_SHARE: f64 = 0.1;
 /// Prior of the rate A, m/s; it and the size are otherwise as likely in each octave.

@@ -14,7 +14,7 @@ use nalgebra::{Matrix4, Vector2, Vector4};
 const TIP_AT: f64 = 0.35;
 const TIP_FARTHER: f64 = 0.55;
 /// One sigma of that share.
-const TIP_SIGMA: f64 = 0.2;
+const TIP_SIGMA: f64 = 0.15;
 /// Lean of a flame in the wind against its height: `LEAN u / sqrt(g h)`, at most [`MOST_LEAN`].
 const LEAN: f64 = 0.3;
 const MOST_LEAN: f64 = 1.2;
