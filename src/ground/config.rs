@@ -56,6 +56,7 @@ pub struct GroundConfig {
     pub(super) listen: SocketAddr,
     pub(super) host_names: Vec<String>,
     pub(super) data_dir: PathBuf,
+    pub(super) exercise: bool,
     pub(super) mavlink: Option<MavlinkConfig>,
     pub(super) uavs: Vec<Uav>,
 }
@@ -84,6 +85,8 @@ struct RawConfig {
     #[serde(default)]
     host_names: Vec<String>,
     data_dir: PathBuf,
+    #[serde(default)]
+    exercise: bool,
     mavlink: Option<RawMavlink>,
     #[serde(default)]
     uav: Vec<RawUav>,
@@ -121,6 +124,7 @@ const KNOWN: &[&str] = &[
     "allow_remote",
     "host_names",
     "data_dir",
+    "exercise",
     "mavlink.url",
     "mavlink.system_id",
     "mavlink.component_id",
@@ -204,6 +208,7 @@ fn check(
     Some(GroundConfig {
         listen: listen?,
         host_names: raw.host_names,
+        exercise: raw.exercise,
         data_dir: overrides
             .data_dir
             .unwrap_or_else(|| folder.join(raw.data_dir)),

@@ -43,7 +43,7 @@ pub(super) fn open(station: &Arc<Station>, last_event_id: Option<i64>) -> Option
     let (sender, receiver) = mpsc::channel(QUEUED);
     let stream = Stream {
         cursor: Cursor::new(station, last_event_id),
-        newest_row: station.newest_row.subscribe(),
+        newest_row: station.rows(),
         notices: station.notices.subscribe(),
         stopping: station.stopping.subscribe(),
         sender,
@@ -82,7 +82,7 @@ enum Cursor {
 impl Cursor {
     /// An id beyond what we have is of another store: then all is told from the start.
     fn new(station: &Station, last_event_id: Option<i64>) -> Self {
-        let until = *station.newest_row.borrow();
+        let until = *station.rows().borrow();
         match last_event_id {
             Some(after) if (0..=until).contains(&after) => Self::Following { after },
             _ => Self::Standing { after: 0, until },
@@ -90,7 +90,7 @@ impl Cursor {
     }
 
     /// The next page and where the cursor stands behind it.
-    fn read(self, store: &Store) -> Result<(Vec<Row>, Self), StoreError> {
+    fn read(self, store: &dyn Store) -> Result<(Vec<Row>, Self), StoreError> {
         match self {
             Self::Following { after } => {
                 let rows = store.told_after(after, PAGE)?;
@@ -98,7 +98,7 @@ impl Cursor {
                 Ok((rows, Self::Following { after }))
             }
             Self::Standing { after, until } => {
-                let mut rows = store.incidents_after(after, PAGE)?;
+                let mut rows = store.latest_after(after, PAGE)?;
                 let more = rows.len() == PAGE as usize;
                 rows.retain(|row| row.row <= until);
                 let next = match rows.last() {

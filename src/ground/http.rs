@@ -4,6 +4,8 @@
 //! by an address, `localhost` or a configured name, and bodies must call themselves JSON: a web
 //! page from elsewhere, open in the duty officer's browser, can neither read nor post alarms.
 
+mod incidents;
+
 use super::events::{self, MAX_STREAMS};
 use super::store::{Completeness, Kept, StoreError};
 use super::tracks::Source;
@@ -30,7 +32,7 @@ const MAX_BODY: usize = 64 * 1024;
 const MAX_REQUEST_TIME: Duration = Duration::from_secs(10);
 /// Source of alarms as the store names it.
 const LINK_NAME: &str = "http";
-/// Incidents read from the store at once.
+/// Alarms read from the store at once.
 const PAGE: u32 = 512;
 
 type Shared = State<Arc<Station>>;
@@ -57,6 +59,13 @@ pub(super) fn router(station: Arc<Station>, host_names: Arc<[String]>) -> Router
         .route("/alarms", post(post_alarm))
         .route("/alarms/test", post(post_test))
         .route("/alarms.geojson", get(alarms))
+        .route("/incidents.geojson", get(incidents::collection))
+        .route("/incidents/changes", get(incidents::changes))
+        .route("/incidents/{id}", get(incidents::whole))
+        .route("/incidents/{id}/chip.jpg", get(incidents::chip))
+        .route("/incidents/{id}/actions", post(incidents::act))
+        .route("/alarms/{id}/chips/{revision}", post(incidents::take_chip))
+        .route("/actions", get(incidents::for_aircraft))
         .route("/track", post(post_track))
         .route("/track.geojson", get(tracks))
         .route("/events", get(event_stream))
@@ -263,7 +272,7 @@ async fn alarms(State(station): Shared) -> Response {
             let mut features: Vec<String> = Vec::new();
             let mut after = 0;
             loop {
-                let page = store.incidents_after(after, PAGE)?;
+                let page = store.latest_after(after, PAGE)?;
                 let Some(last) = page.last() else {
                     return Ok(features);
                 };
@@ -336,6 +345,7 @@ async fn health(State(station): Shared) -> Response {
             "repeated": counters.repeated.load(Ordering::Relaxed),
             "refused": counters.refused.load(Ordering::Relaxed),
         },
+        "waiting": station.writer.waiting(),
         "streams": counters.streams.load(Ordering::Relaxed),
         "mavlink": mavlink,
         "aircraft": aircraft,

@@ -18,35 +18,52 @@
 //! **Assumptions.** Whoever can reach the address may post: there is no authentication yet, so it
 //! must be a loopback address unless the configuration says `allow_remote = true`.
 //!
-//! **Known limits.** Sightings of one fire by several aircraft stay several incidents. Aircraft
-//! tracks live in memory ([`tracks::MAX_POINTS`] points each) and start anew with the process.
+//! **Ways inside.** What comes goes through one queue to one [`writer`], which keeps the book
+//! ([`book`]: who is one fire with whom), commits a batch with one sync, and only then answers and
+//! shows it on the [`board`].
+//!
+//! **Known limits.** Aircraft tracks live in memory ([`tracks::MAX_POINTS`] points each) and start anew with the process.
 
+pub mod action;
+mod board;
+mod book;
+pub mod chips;
 pub mod config;
 mod events;
 mod http;
+pub mod incident;
 mod listener;
 mod mavlink;
+mod merge;
 pub mod store;
 #[cfg(test)]
 mod tests;
 pub mod tracks;
+mod writer;
 
+pub use chips::ChipError;
 pub use config::{ConfigError, GroundConfig, Overrides};
+pub use incident::{Incident, News};
 pub use store::StoreError;
 pub use tracks::{Ping, PingError};
+pub use writer::{Done, Order, OrderError};
 
 use crate::alarm::{Alarm, AlarmError};
+use board::Board;
+use chips::Chips;
 use emberfix_frames::{CovarianceError, ServiceTime};
 use emberfix_mav::{Link, LinkError};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLockReadGuard};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use store::sqlite::Sqlite;
 use store::{Completeness, Delivery, Kept, Store};
 use tokio::sync::{broadcast, watch};
 use tokio::task::JoinHandle;
 use tracks::{Source, Tracks};
+use writer::{Published, Writer};
 
 /// Notices that a slow event stream may lag behind; the oldest are then skipped, for it.
 const NOTICES_QUEUED: usize = 64;
@@ -72,6 +89,9 @@ pub enum GroundError {
         /// What the system said.
         source: std::io::Error,
     },
+    /// The folder of images can't be opened.
+    #[error(transparent)]
+    Chips(#[from] ChipError),
     /// The MAVLink port can't be opened.
     #[error(transparent)]
     Mavlink(#[from] LinkError),
@@ -236,10 +256,12 @@ struct Notice {
 /// What every edge of the ground station shares.
 #[derive(Debug)]
 pub(crate) struct Station {
-    store: Arc<Store>,
+    store: Arc<dyn Store>,
+    writer: Writer,
+    /// What stands, and the newest row of the journal; only ever what is on disk.
+    published: Arc<Published>,
+    chips: Arc<Mutex<Chips>>,
     tracks: Mutex<Tracks>,
-    /// Newest row that streams should tell; streams read the rows themselves, from the store.
-    newest_row: watch::Sender<i64>,
     /// What is told once. Bound: [`NOTICES_QUEUED`]; loss: oldest first, per stream.
     notices: broadcast::Sender<Notice>,
     stopping: watch::Sender<bool>,
@@ -257,12 +279,17 @@ struct Counters {
 
 impl Station {
     fn open(config: &GroundConfig) -> Result<Self, GroundError> {
-        let store = Store::open(&config.data_dir)?;
-        let newest = store.newest_row()?;
+        let store: Arc<dyn Store> = Arc::new(Sqlite::open(&config.data_dir)?);
+        let chips = Arc::new(Mutex::new(Chips::open(config.data_dir.join("chips"))?));
+        let seen = Arc::clone(&chips);
+        let has_chip = Box::new(move |alarm: &str| lock(&seen).has(alarm));
+        let (writer, published) = Writer::start(Arc::clone(&store), config.exercise, has_chip)?;
         Ok(Self {
-            store: Arc::new(store),
+            store,
+            writer,
+            published,
+            chips,
             tracks: Mutex::default(),
-            newest_row: watch::Sender::new(newest),
             notices: broadcast::Sender::new(NOTICES_QUEUED),
             stopping: watch::Sender::new(false),
             counters: Counters::default(),
@@ -304,15 +331,77 @@ impl Station {
             link,
             completeness,
         };
-        let kept = self.with_store(move |store| store.keep(&delivery)).await?;
-        if let Kept::New { row, tells: true } = kept {
-            self.newest_row.send_if_modified(|newest| {
-                let newer = row > *newest;
-                *newest = row.max(*newest);
-                newer
-            });
-        }
+        let kept = self.writer.keep(delivery).await?;
         Ok((alarm, kept))
+    }
+
+    /// All incidents that stand in memory, by id. Older ones are on disk ([`store::Search`]).
+    pub(crate) fn incidents(&self) -> Vec<Arc<Incident>> {
+        self.board().all().cloned().collect()
+    }
+
+    /// An incident by its id; of one that went into another, that other.
+    pub(crate) fn incident(&self, id: &str) -> Option<Arc<Incident>> {
+        self.board().get(id).cloned()
+    }
+
+    /// At most `limit` incidents that changed after a row of the journal, each once and as it is
+    /// now, oldest change first. Go on from the last one's row, and wait with [`Self::rows`].
+    pub(crate) fn incidents_since(&self, row: i64, limit: usize) -> Vec<News> {
+        self.board().since(row, limit)
+    }
+
+    /// The newest row of the journal, whenever it rises.
+    pub(crate) fn rows(&self) -> watch::Receiver<i64> {
+        self.published.newest_row.subscribe()
+    }
+
+    /// Carries out and records what an operator orders.
+    pub(crate) async fn act(&self, order: Order) -> Result<Done, OrderError> {
+        self.writer.act(order).await
+    }
+
+    /// An aircraft says up to where it has learnt what operators did. Written down behind its back;
+    /// lost in a crash, it is said again with the next question.
+    fn fetched(self: &Arc<Self>, uav: String, number: i64) {
+        if number <= 0 || uav.len() > 64 {
+            return;
+        }
+        let writer = self.writer.clone();
+        tokio::spawn(async move { drop(writer.fetched(uav, number, now()).await) });
+    }
+
+    /// Keeps the image of an alarm unless a newer one is there; true when it was kept.
+    pub(crate) async fn keep_chip(
+        &self,
+        alarm: &str,
+        revision: u32,
+        jpeg: Vec<u8>,
+    ) -> Result<bool, ChipError> {
+        let (chips, id) = (Arc::clone(&self.chips), alarm.to_owned());
+        let kept = tokio::task::spawn_blocking(move || lock(&chips).keep(&id, revision, &jpeg));
+        let kept = kept.await.unwrap_or(Ok(false))?;
+        if kept {
+            self.writer.chip(alarm.to_owned());
+        }
+        Ok(kept)
+    }
+
+    /// Where the image of an incident lies: that of the alarm that was seen last.
+    pub(crate) fn chip_of(&self, incident: &Incident) -> Option<PathBuf> {
+        let chips = lock(&self.chips);
+        let with = incident
+            .alarms
+            .iter()
+            .filter(|member| chips.has(&member.alarm));
+        chips.find(&with.max_by_key(|member| member.captured_at)?.alarm)
+    }
+
+    fn board(&self) -> RwLockReadGuard<'_, Board> {
+        self.published
+            .board
+            .read()
+            .unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Checks a test alarm as if it were one, and shows that a test came. Nothing is kept.
@@ -331,10 +420,10 @@ impl Station {
     /// Runs work on the store where it may block.
     async fn with_store<T: Send + 'static>(
         &self,
-        work: impl FnOnce(&Store) -> Result<T, StoreError> + Send + 'static,
+        work: impl FnOnce(&dyn Store) -> Result<T, StoreError> + Send + 'static,
     ) -> Result<T, StoreError> {
         let store = Arc::clone(&self.store);
-        tokio::task::spawn_blocking(move || work(&store))
+        tokio::task::spawn_blocking(move || work(store.as_ref()))
             .await
             .unwrap_or(Err(StoreError::Stopped))
     }

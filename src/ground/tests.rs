@@ -181,7 +181,8 @@ async fn a_stream_begins_with_what_stands_goes_on_live_and_resumes_by_id() {
 async fn many_incidents_reach_a_new_stream_each_once_in_order() {
     let folder = tempfile::tempdir().unwrap();
     {
-        let store = super::store::Store::open(folder.path()).unwrap();
+        let store = super::store::sqlite::Sqlite::open(folder.path()).unwrap();
+        let kit = super::store::tests::Kit::open(std::sync::Arc::new(store));
         for number in 0..300 {
             let raw = feature(&format!("a-{number}"), 1, "2026-03-01T12:00:00Z");
             let alarm = Alarm::from_geojson(raw.as_bytes()).unwrap();
@@ -192,7 +193,7 @@ async fn many_incidents_reach_a_new_stream_each_once_in_order() {
                 link: "test",
                 completeness: super::Completeness::Full,
             };
-            store.keep(&delivery).unwrap();
+            kit.keep(delivery).await.unwrap();
         }
     }
     let ground = start(folder.path()).await;
