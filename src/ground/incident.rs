@@ -186,8 +186,8 @@ impl Incident {
             alarms: parts.iter().map(Member::of).collect(),
             altitude_msl_m: fused.place.height().m() - undulation,
             covariance_enu_m2: fused.covariance.row_major(),
-            ce90_m: only_or(parts, |alarm| alarm.ce90_m, fused.covariance.ce90_m()),
-            le90_m: only_or(parts, |alarm| alarm.le90_m, fused.covariance.le90_m()),
+            ce90_m: only_or(parts, |alarm| alarm.ce90_m, || fused.covariance.ce90_m()),
+            le90_m: only_or(parts, |alarm| alarm.le90_m, || fused.covariance.le90_m()),
             place: fused.place,
             class: class(parts),
             state: latest.properties.state,
@@ -270,11 +270,11 @@ fn coordinates(place: &Wgs84) -> [f64; 3] {
 fn only_or(
     parts: &[Part<'_>],
     told: impl Fn(&crate::alarm::AlarmProperties) -> f64,
-    fused: f64,
+    fused: impl FnOnce() -> f64,
 ) -> f64 {
     match parts {
         [only] => told(&only.alarm.properties),
-        _ => fused,
+        _ => fused(),
     }
 }
 
