@@ -1,87 +1,154 @@
-//! A real browser sees the fire on the ground station's page: the real `emberfix ground`, an alarm
-//! over HTTP, Chromium. Exit code 77 of the client means that there is no browser here.
+//! A real browser in front of the ground station's page: the real `emberfix ground`, alarms over HTTP,
+//! Chromium. Exit code 77 of the client means that there is no browser here.
 
 #![expect(clippy::unwrap_used, reason = "a test may stop at its first surprise")]
 
 #[path = "support/clients.rs"]
-#[expect(
-    dead_code,
-    reason = "the browser is run to its end, and states no facts"
-)]
+#[expect(dead_code, reason = "no client states facts here")]
 mod clients;
+#[path = "support/station.rs"]
+mod station;
 #[expect(dead_code, reason = "no mission is flown here")]
 mod support;
 
 use clients::{Clients, Running};
-use emberfix::alarm::Alarm;
-use emberfix::deliver::http::HttpLink;
+use serde_json::{Value, json};
+use station::{Station, eventually, fire};
 use std::process::Command;
-use support::Said;
+use std::time::{SystemTime, UNIX_EPOCH};
+use support::{Said, root};
 
-/// A fire at P3's place, as an aircraft tells it.
-const FIRE: &str = r#"{"type": "Feature",
-    "geometry": {"type": "Point", "coordinates": [119.1120167, 31.4094222, 11.06]},
-    "properties": {"id": "uav-1-7", "revision": 1, "uav": "uav-1", "class": "fire",
-        "state": "growing", "confidence": 0.95,
-        "first_seen_at": "2026-03-01T04:00:10.000000000Z",
-        "captured_at": "2026-03-01T04:00:14.000000000Z",
-        "altitude_msl_m": 8.7067, "height_above_ground_m": 0.1, "ce90_m": 3.2, "le90_m": 4.1,
-        "covariance_enu_m2": [2.25, 0, 0, 0, 2.25, 0, 0, 0, 6.25], "methods": ["stereo"],
-        "sightings": 9, "range_m": 21.5, "size_m": {"width": 6.2, "height": 2.1},
-        "size_sigma_m": {"width": 0.6, "height": 0.5}, "size_class": "large",
-        "trend": 0.031, "trend_sigma": 0.008, "trend_probability": {"growing": 0.99, "dying": 0.0},
-        "intensity": {"value": 2.1, "sigma": 0.2},
-        "intensity_history": [[-20, 1.0], [-15, 1.1], [-10, 1.3], [-5, 1.7], [0, 2.1]],
-        "area": {"polygon": [[119.11198, 31.40941], [119.11204, 31.40941], [119.11206, 31.40944],
-            [119.11204, 31.40947], [119.11198, 31.40947], [119.11197, 31.40944]],
-            "edge_sigma_m": 0.7, "square_metres": {"value": 38.0, "sigma": 7.0},
-            "front": [[119.11204, 31.40941], [119.11206, 31.40944], [119.11204, 31.40947]]},
-        "spread": {"azimuth_deg": {"value": 92.0, "sigma": 8.0},
-            "speed_m_s": {"value": 0.21, "sigma": 0.04}, "used_wind": true},
-        "degraded": []}}"#;
-
-#[test]
-fn a_browser_sees_the_fire_and_asks_no_other_server() {
-    let Some(clients) = Clients::find() else {
-        return;
-    };
-    let folder = tempfile::tempdir().unwrap();
-    let config = folder.path().join("ground.toml");
-    std::fs::write(&config, "listen = \"127.0.0.1:0\"\ndata_dir = \"data\"\n").unwrap();
-    let mut ground = Command::new(env!("CARGO_BIN_EXE_emberfix"));
-    ground.arg("ground").arg(&config);
-    let (ground, line) = Running::start(ground, "http://");
-    let url = line
-        .split_whitespace()
-        .find(|word| word.starts_with("http://"))
-        .unwrap();
-
-    let alarm = Alarm::from_geojson(FIRE.as_bytes()).unwrap();
-    HttpLink::new(url).unwrap().send_alarm(&alarm).unwrap();
-
+/// The browser, ready to be given arguments; with axe-core where Node brought it.
+fn browser(clients: &Clients, station: &Station) -> Command {
     let mut browser = clients.client("browser_check.py");
-    browser.args([
-        url,
-        "--expect",
-        "uav-1-7",
-        "--expect",
-        "31.409422, 119.112017",
-        "--expect",
-        "large: 6.2 m ± 0.6 m wide, 2.1 m ± 0.5 m high",
-        "--expect",
-        "to the east (092° ± 8°), 0.21 ± 0.04 m/s",
-        "--expect",
-        "Intensity over 20 s: now 2.1 times what it was",
-        "--eval",
-        "document.querySelectorAll('.mark .front').length",
-    ]);
-    let said = Said::of(&browser.output().unwrap());
-    drop(ground);
+    browser.args([&station.url, "--seconds", "20"]);
+    let axe = root().join(".x/node/node_modules/axe-core/axe.min.js");
+    if axe.is_file() {
+        browser.arg("--axe").arg(axe);
+    } else {
+        println!("without axe-core (Node 20 or newer, then ./x setup)");
+    }
+    browser
+}
+
+/// What the browser saw; `None` where there is none.
+fn seen(said: &Said) -> Option<Value> {
     if said.code == 77 {
         println!("skipped: no browser (set EMBERFIX_BROWSER)");
+        return None;
+    }
+    let seen: Value = serde_json::from_str(&said.out).unwrap_or_else(|_| panic!("{}", said.err));
+    assert_eq!(seen["ok"], true, "{seen:#}");
+    assert_eq!(seen["foreign_requests"], json!([]), "{seen:#}");
+    Some(seen)
+}
+
+/// When a step was done, seconds of Unix time.
+fn at(seen: &Value, step: &str) -> f64 {
+    let steps = seen["steps"].as_array().unwrap();
+    let step = steps.iter().find(|s| s["step"] == step).unwrap();
+    step["unix_s"].as_f64().unwrap()
+}
+
+fn unix_s() -> f64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_secs_f64()
+}
+
+#[test]
+fn an_alarm_appears_within_a_second_and_is_acknowledged_and_taken_back() {
+    let Some(clients) = Clients::find() else { return };
+    let station = Station::start("");
+    let mut browser = browser(&clients, &station);
+    for step in [
+        "wait:Live",
+        "ready:",
+        "wait:uav-1-7",
+        "key:j",
+        "wait:31.409422, 119.112017",
+        "wait:large: 6.2 m ± 0.6 m wide, 2.1 m ± 0.5 m high",
+        "wait:to the east (092° ± 8°), 0.21 ± 0.04 m/s",
+        "wait:Intensity over 20 s: now 2.1 times what it was",
+        "wait:50R QV 00780 76906",
+        "key:a",
+        "fill:#name=Ana",
+        "click:#name-dialog button[value=ok]",
+        "wait:Acknowledged by Ana",
+        "key:d",
+        "wait:Dismissed by Ana",
+        "key:u",
+        "wait:Acknowledged by Ana",
+        "gone:Dismissed by Ana",
+    ] {
+        browser.args(["--do", step]);
+    }
+    browser.args(["--eval", "document.querySelectorAll('.mark .front').length"]);
+    let (mut browser, _) = Running::start(browser, "ready {");
+    let told_s = unix_s();
+    station.tell(&fire());
+    let kept_s = unix_s();
+    let Some(seen) = seen(&browser.wait()) else { return };
+
+    let late_s = at(&seen, "wait:uav-1-7") - kept_s;
+    println!("on the page {late_s:.2} s after it was on disk, {:.2} s after it was sent", late_s + kept_s - told_s);
+    assert!(late_s < 1.0, "{late_s} s");
+    let operator = |incident: &Value| incident["properties"]["operator"].clone();
+    let incident = station.get("/incidents/uav-1-7");
+    assert_eq!(operator(&incident)["state"], "acknowledged", "{incident:#}");
+    assert_eq!(operator(&incident)["by"], "Ana");
+    // What the aircraft is told when it asks.
+    let actions = station.get("/actions?uav=uav-1&after=0");
+    assert_eq!(actions["actions"][0]["kind"], "acknowledge", "{actions:#}");
+    assert_eq!(seen["values"].as_object().unwrap().values().next(), Some(&json!(1)), "the front is drawn");
+}
+
+#[test]
+fn two_aircrafts_fires_are_put_together_and_taken_apart_by_hand() {
+    let Some(clients) = Clients::find() else { return };
+    let station = Station::start("");
+    station.tell(&fire());
+    // 60 m further east: nobody takes it for the same fire.
+    let mut other = fire();
+    other["properties"]["id"] = "uav-2-1".into();
+    other["properties"]["uav"] = "uav-2".into();
+    other["geometry"]["coordinates"][0] = 119.11265.into();
+    station.tell(&other);
+    let mut browser = browser(&clients, &station);
+    for step in [
+        "eval:localStorage.setItem('operator', 'Ana')",
+        "wait:uav-2-1",
+        "click:[data-choose='uav-1-7']",
+        "key:m",
+        "wait:Which incident is the same fire as uav-1-7?",
+        "click:[data-choose='uav-2-1']",
+        "wait:uav-1-7 and uav-2-1 are one fire",
+        "wait:Put together from",
+        "click:[data-with='uav-2-1']",
+        "wait:uav-2-1 is a fire of its own",
+        "gone:Put together from",
+    ] {
+        browser.args(["--do", step]);
+    }
+    browser.args(["--scheme", "dark"]);
+    if seen(&Said::of(&browser.output().unwrap())).is_none() {
         return;
     }
-    let seen = said.json();
-    assert_eq!(seen["ok"], true, "{seen:#}");
-    assert_eq!(seen["foreign_requests"], serde_json::json!([]), "{seen:#}");
+    let apart = |all: &Value| all["features"].as_array().unwrap().len() == 2;
+    let all = eventually(|| station.get("/incidents.geojson"), apart);
+    assert!(apart(&all), "{all:#}");
+}
+
+#[test]
+fn a_lost_line_is_shown_with_the_age_of_what_is_seen() {
+    let Some(clients) = Clients::find() else { return };
+    let station = Station::start("");
+    station.tell(&fire());
+    let mut browser = browser(&clients, &station);
+    for step in ["wait:uav-1-7", "ready:", "wait:No connection to the ground station. What you see is as of", "wait:uav-1-7"] {
+        browser.args(["--do", step]);
+    }
+    browser.args(["--phone", "--window", "390x844"]);
+    let (mut browser, _) = Running::start(browser, "ready {");
+    station.kill();
+    let Some(seen) = seen(&browser.wait()) else { return };
+    assert!(seen["title"].as_str().unwrap().contains("No connection"), "{seen:#}");
 }

@@ -23,6 +23,7 @@ pub mod link;
 pub mod outgoing;
 pub mod telemetry;
 pub mod tlog;
+pub mod traffic;
 pub mod wire;
 
 pub use inbox::Inbox;

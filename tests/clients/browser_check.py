@@ -3,6 +3,10 @@
 
 Speaks the DevTools protocol, so that a page with an open event stream is no trouble. The browser can
 reach this machine only: a page that needs the internet shows up in `foreign_requests` or not at all.
+With --do it has hands, too. Steps, in order: `wait:TEXT`, `gone:TEXT`, `click:SELECTOR`, `fill:SELECTOR=TEXT`,
+`key:KEY`, `eval:JS`, `shot:OUT.png`, `pause:SECONDS`, `ready:` (prints `ready {..}` on stderr: the caller may act).
+--axe runs axe-core on what stands in the end, and lists what it finds.
+
 Exit code: 0 seen, 1 not seen in time or the page threw, 77 no browser here (a test may skip).
 """
 
@@ -72,7 +76,7 @@ class Page:
         self.errors = []
         self.console = []
         self.requests = []
-        width, height = window
+        width, height = window.size
         for method in ("Page.enable", "Runtime.enable", "Log.enable", "Network.enable"):
             self.call(method)
         self.call(
@@ -80,8 +84,10 @@ class Page:
             width=width,
             height=height,
             deviceScaleFactor=1,
-            mobile=False,
+            mobile=window.phone,
         )
+        scheme = {"name": "prefers-color-scheme", "value": window.scheme}
+        self.call("Emulation.setEmulatedMedia", features=[scheme])
 
     @staticmethod
     def _wait_for_port(profile):
@@ -144,6 +150,23 @@ class Page:
             "[...document.querySelectorAll('svg text')].map(t => t.textContent).join('\\n') : ''"
         )
 
+    def wait_until(self, holds, limit_s):
+        """Whether it held in time."""
+        end = time.monotonic() + limit_s
+        while not (held := holds(self.text())) and time.monotonic() < end:
+            time.sleep(0.02)
+        return held
+
+    def key(self, key):
+        text = {"text": key} if len(key) == 1 else {}
+        self.call("Input.dispatchKeyEvent", type="keyDown", key=key, **text)
+        self.call("Input.dispatchKeyEvent", type="keyUp", key=key)
+
+    def element(self, selector, then):
+        """Does something with the first element that can be seen; says whether there was one."""
+        found = f"[...document.querySelectorAll({json.dumps(selector)})].find(e => e.checkVisibility())"
+        return self.evaluate(f"(() => {{ const e = {found}; if (!e) return false; {then}; return true; }})()")
+
     def wait_for(self, expected, limit_s):
         """How long each text took to appear; those that did not are absent."""
         began = time.monotonic()
@@ -159,6 +182,66 @@ class Page:
     def screenshot(self, path):
         data = self.call("Page.captureScreenshot", format="png")["data"]
         Path(path).write_bytes(base64.b64decode(data))
+
+
+class Hands:
+    """Does one step after the other; a step that can't be done ends it."""
+
+    def __init__(self, page, limit_s):
+        self.page, self.limit_s, self.done = page, limit_s, []
+
+    def run(self, steps):
+        return all(self.step(step) for step in steps)
+
+    def step(self, step):
+        what, _, rest = step.partition(":")
+        value = getattr(self, what)(rest)
+        self.done.append({"step": step, "value": value, "unix_s": time.time()})
+        return value is not False
+
+    def wait(self, text):
+        return self.page.wait_until(lambda seen: text in seen, self.limit_s)
+
+    def gone(self, text):
+        return self.page.wait_until(lambda seen: text not in seen, self.limit_s)
+
+    def click(self, selector):
+        end = time.monotonic() + self.limit_s
+        while not (clicked := self.page.element(selector, "e.click()")) and time.monotonic() < end:
+            time.sleep(0.05)
+        return clicked
+
+    def fill(self, rest):
+        selector, _, text = rest.rpartition("=")
+        then = f"e.value = {json.dumps(text)}; e.dispatchEvent(new Event('input', {{bubbles: true}}))"
+        return self.page.element(selector, then)
+
+    def key(self, key):
+        self.page.key(key)
+
+    def eval(self, expression):
+        value = self.page.evaluate(expression)
+        return "false" if value is False else value
+
+    def shot(self, path):
+        self.page.screenshot(path)
+
+    def pause(self, seconds):
+        time.sleep(float(seconds))
+
+    def ready(self, _):
+        print("ready {}", file=sys.stderr, flush=True)
+
+
+def violations(page, source):
+    """What axe-core finds, in short; its source goes past the page's own rules on scripts."""
+    page.evaluate(Path(source).read_text() + "; undefined")
+    found = page.evaluate(
+        "axe.run(document, {resultTypes: ['violations']}).then(r => r.violations.map(v => "
+        "({id: v.id, impact: v.impact, help: v.help, nodes: v.nodes.map(n => n.html.slice(0, 160) + ' ' + "
+        "(n.any[0]?.message ?? ''))})))"
+    )
+    return found
 
 
 def foreign(requests, url):
@@ -179,14 +262,21 @@ def look(browser, args):
             start_new_session=True,
         )
         try:
-            page = Page(profile, args.window)
+            page = Page(profile, args)
             opened = page.call("Page.navigate", url=args.url)
             seen = page.wait_for(args.expect, args.seconds)
+            hands = Hands(page, args.seconds)
+            did_all = hands.run(args.do)
+            found = violations(page, args.axe) if args.axe else None
             values = {expression: page.evaluate(expression) for expression in args.eval}
             if args.screenshot:
                 page.screenshot(args.screenshot)
             return {
-                "ok": len(seen) == len(args.expect) and not page.errors and not opened.get("errorText"),
+                "ok": len(seen) == len(args.expect)
+                and did_all
+                and not found
+                and not page.errors
+                and not opened.get("errorText"),
                 "url": args.url,
                 "load_error": opened.get("errorText"),
                 "seen_after_s": seen,
@@ -194,6 +284,8 @@ def look(browser, args):
                 "title": page.evaluate("document.title"),
                 "text": page.text(),
                 "values": values,
+                "steps": hands.done,
+                "violations": found,
                 "errors": page.errors,
                 "console": page.console,
                 "foreign_requests": foreign(page.requests, args.url),
@@ -221,10 +313,15 @@ def main():
     add("--seconds", type=float, default=20.0, help="how long to wait for it")
     add("--eval", action="append", default=[], metavar="JS", help="an expression whose value to report")
     add("--screenshot", metavar="OUT.png")
-    add("--window", type=size, default=(1280, 800), metavar="WxH")
+    add("--do", action="append", default=[], metavar="STEP", help="see above; may come again")
+    add("--axe", metavar="FILE", help="axe-core's axe.min.js")
+    add("--window", dest="size", type=size, default=(1280, 800), metavar="WxH")
+    add("--scheme", choices=["light", "dark"], default="light")
+    add("--phone", action="store_true")
     args = parser.parse_args()
     browser = find_browser()
     if not browser:
+        print("ready {}", file=sys.stderr, flush=True)
         print(json.dumps({"ok": False, "skipped": "no Chromium or Chrome found"}))
         sys.exit(SKIPPED)
     result = look(browser, args)

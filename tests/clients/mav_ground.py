@@ -49,9 +49,10 @@ class Ground:
         return bool(until) and all(self.book.kept[name] for name in until)
 
     def send_heartbeats(self):
-        heartbeat = mavlink.MAVLink_heartbeat_message(
-            mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3
-        )
+        kind, autopilot = mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID
+        if self.args.as_autopilot:
+            kind, autopilot = mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4
+        heartbeat = mavlink.MAVLink_heartbeat_message(kind, autopilot, 0, 0, mavlink.MAV_STATE_ACTIVE, 3)
         self.link.send(heartbeat)
         if self.args.ack_as:
             self.link.send(heartbeat, *self.args.ack_as)
@@ -108,6 +109,7 @@ def arguments():
     add("--connect", metavar="HOST:PORT", help="send there first, instead of listening")
     add("--seconds", type=float, default=10.0, help="how long; SIGTERM ends it sooner, with its summary")
     add("--ack-as", type=identity, metavar="SYSTEM/COMPONENT", help="e.g. 254/191: acknowledge alarms to it")
+    add("--as-autopilot", action="store_true", help="claim to be one: what must never be sent markers")
     add("--ignore-first", type=int, default=0, metavar="N", help="leave the first N alarms unanswered")
     add("--vehicle", type=int, default=1, help="system id to ask for messages")
     add("--request-geo-status-hz", type=float, default=0.0, metavar="HZ")

@@ -90,6 +90,7 @@ class Book:
         "COMMAND_INT": "command_ints",
         "COMMAND_LONG": "command_longs",
         "COMMAND_ACK": "command_acks",
+        "ADSB_VEHICLE": "traffic",
     }
 
     def __init__(self):
