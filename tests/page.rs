@@ -7,6 +7,7 @@
 #[expect(dead_code, reason = "no client states facts here")]
 mod clients;
 #[path = "support/station.rs"]
+#[expect(dead_code, reason = "only the browser acts here")]
 mod station;
 #[expect(dead_code, reason = "no mission is flown here")]
 mod support;
@@ -37,7 +38,7 @@ fn seen(said: &Said) -> Option<Value> {
         println!("skipped: no browser (set EMBERFIX_BROWSER)");
         return None;
     }
-    let seen: Value = serde_json::from_str(&said.out).unwrap_or_else(|_| panic!("{}", said.err));
+    let seen: Value = serde_json::from_str(&said.out).unwrap();
     assert_eq!(seen["ok"], true, "{seen:#}");
     assert_eq!(seen["foreign_requests"], json!([]), "{seen:#}");
     Some(seen)
@@ -51,12 +52,17 @@ fn at(seen: &Value, step: &str) -> f64 {
 }
 
 fn unix_s() -> f64 {
-    SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_secs_f64()
+    SystemTime::now()
+        .duration_since(UNIX_EPOCH)
+        .unwrap()
+        .as_secs_f64()
 }
 
 #[test]
 fn an_alarm_appears_within_a_second_and_is_acknowledged_and_taken_back() {
-    let Some(clients) = Clients::find() else { return };
+    let Some(clients) = Clients::find() else {
+        return;
+    };
     let station = Station::start("");
     let mut browser = browser(&clients, &station);
     for step in [
@@ -86,10 +92,15 @@ fn an_alarm_appears_within_a_second_and_is_acknowledged_and_taken_back() {
     let told_s = unix_s();
     station.tell(&fire());
     let kept_s = unix_s();
-    let Some(seen) = seen(&browser.wait()) else { return };
+    let Some(seen) = seen(&browser.wait()) else {
+        return;
+    };
 
     let late_s = at(&seen, "wait:uav-1-7") - kept_s;
-    println!("on the page {late_s:.2} s after it was on disk, {:.2} s after it was sent", late_s + kept_s - told_s);
+    println!(
+        "on the page {late_s:.2} s after it was on disk, {:.2} s after it was sent",
+        late_s + kept_s - told_s
+    );
     assert!(late_s < 1.0, "{late_s} s");
     let operator = |incident: &Value| incident["properties"]["operator"].clone();
     let incident = station.get("/incidents/uav-1-7");
@@ -98,12 +109,18 @@ fn an_alarm_appears_within_a_second_and_is_acknowledged_and_taken_back() {
     // What the aircraft is told when it asks.
     let actions = station.get("/actions?uav=uav-1&after=0");
     assert_eq!(actions["actions"][0]["kind"], "acknowledge", "{actions:#}");
-    assert_eq!(seen["values"].as_object().unwrap().values().next(), Some(&json!(1)), "the front is drawn");
+    assert_eq!(
+        seen["values"].as_object().unwrap().values().next(),
+        Some(&json!(1)),
+        "the front is drawn"
+    );
 }
 
 #[test]
 fn two_aircrafts_fires_are_put_together_and_taken_apart_by_hand() {
-    let Some(clients) = Clients::find() else { return };
+    let Some(clients) = Clients::find() else {
+        return;
+    };
     let station = Station::start("");
     station.tell(&fire());
     // 60 m further east: nobody takes it for the same fire.
@@ -139,16 +156,28 @@ fn two_aircrafts_fires_are_put_together_and_taken_apart_by_hand() {
 
 #[test]
 fn a_lost_line_is_shown_with_the_age_of_what_is_seen() {
-    let Some(clients) = Clients::find() else { return };
+    let Some(clients) = Clients::find() else {
+        return;
+    };
     let station = Station::start("");
     station.tell(&fire());
     let mut browser = browser(&clients, &station);
-    for step in ["wait:uav-1-7", "ready:", "wait:No connection to the ground station. What you see is as of", "wait:uav-1-7"] {
+    for step in [
+        "wait:uav-1-7",
+        "ready:",
+        "wait:No connection to the ground station. What you see is as of",
+        "wait:uav-1-7",
+    ] {
         browser.args(["--do", step]);
     }
     browser.args(["--phone", "--window", "390x844"]);
     let (mut browser, _) = Running::start(browser, "ready {");
     station.kill();
-    let Some(seen) = seen(&browser.wait()) else { return };
-    assert!(seen["title"].as_str().unwrap().contains("No connection"), "{seen:#}");
+    let Some(seen) = seen(&browser.wait()) else {
+        return;
+    };
+    assert!(
+        seen["title"].as_str().unwrap().contains("No connection"),
+        "{seen:#}"
+    );
 }

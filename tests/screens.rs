@@ -3,10 +3,11 @@
 #![expect(clippy::unwrap_used, reason = "a test may stop at its first surprise")]
 
 #[path = "support/clients.rs"]
+#[expect(dead_code, reason = "these clients end by themselves")]
 mod clients;
 #[path = "support/station.rs"]
+#[expect(dead_code, reason = "the station is only told and asked here")]
 mod station;
-#[expect(dead_code, reason = "no mission is flown here")]
 mod support;
 
 use clients::{Clients, Running, facts};
@@ -28,17 +29,26 @@ fn read(clients: &Clients, kind: &str, source: &str) -> Value {
 fn is_the_place(found: &Value) {
     let near = |k: usize, want: f64, off: f64| (found[k].as_f64().unwrap() - want).abs() < off;
     // A tenth of a metre: what six decimals of a degree and one of a metre tell.
-    assert!(near(0, 119.1120167, 1e-6) && near(1, 31.4094222, 1e-6), "{found}");
+    assert!(
+        near(0, 119.1120167, 1e-6) && near(1, 31.4094222, 1e-6),
+        "{found}"
+    );
     assert!(near(2, 11.06, 0.1), "{found}");
 }
 
 #[test]
 fn geojson_kml_and_metrics_are_read_by_programs_that_know_the_standard() {
-    let Some(clients) = Clients::find() else { return };
+    let Some(clients) = Clients::find() else {
+        return;
+    };
     let station = Station::start("");
     station.tell(&fire());
 
-    let geojson = read(&clients, "geojson", &format!("{}/incidents.geojson", station.url));
+    let geojson = read(
+        &clients,
+        "geojson",
+        &format!("{}/incidents.geojson", station.url),
+    );
     assert_eq!(geojson["content_type"], "application/geo+json");
     is_the_place(&geojson["features"][0]["coordinates"]);
 
@@ -50,7 +60,10 @@ fn geojson_kml_and_metrics_are_read_by_programs_that_know_the_standard() {
     let placemark = &kml["linked"]["placemarks"][0];
     assert_eq!(placemark["name"], "FIRE uav-1-7");
     assert_eq!(placemark["geometries"], json!(["Point", "Polygon"]));
-    assert_eq!(placemark["shapes"][0][2], 8.71, "KML's absolute altitude is above mean sea level");
+    assert_eq!(
+        placemark["shapes"][0][2], 8.71,
+        "KML's absolute altitude is above mean sea level"
+    );
     is_a_ring_of_90_percent(&placemark["shapes"][1]);
 
     let metrics = read(&clients, "metrics", &format!("{}/metrics", station.url));
@@ -66,13 +79,18 @@ fn is_a_ring_of_90_percent(ring: &Value) {
         let east_m = (corner[0].as_f64().unwrap() - 119.1120167) * 95_081.0;
         let north_m = (corner[1].as_f64().unwrap() - 31.4094222) * 110_870.0;
         // A hundredth for the metres per degree that are worked out by hand here.
-        assert!((east_m.hypot(north_m) - 3.219).abs() < 0.03, "{east_m} {north_m}");
+        assert!(
+            (east_m.hypot(north_m) - 3.219).abs() < 0.03,
+            "{east_m} {north_m}"
+        );
     }
 }
 
 #[test]
 fn cap_alerts_updates_and_cancels_in_one_chain() {
-    let Some(clients) = Clients::find() else { return };
+    let Some(clients) = Clients::find() else {
+        return;
+    };
     let station = Station::start(CAP);
     let feed = format!("{}/cap.atom", station.url);
     let issued = |n: usize| {
@@ -100,7 +118,10 @@ fn cap_alerts_updates_and_cancels_in_one_chain() {
 
     station.act(ID, "confirm");
     let update = issued(2);
-    assert_eq!((&update["msgType"], &update["certainty"]), (&json!("Update"), &json!("Observed")));
+    assert_eq!(
+        (&update["msgType"], &update["certainty"]),
+        (&json!("Update"), &json!("Observed"))
+    );
     let name = |message: &Value| {
         let part = |field: &str| message[field].as_str().unwrap().to_owned();
         [part("sender"), part("identifier"), part("sent")].join(",")
@@ -111,17 +132,29 @@ fn cap_alerts_updates_and_cancels_in_one_chain() {
     let cancel = issued(3);
     assert_eq!(cancel["msgType"], "Cancel");
     assert!(cancel["note"].as_str().unwrap().contains("Ana"), "{cancel}");
-    assert_eq!(cancel["references"], format!("{} {}", name(&alert), name(&update)));
+    assert_eq!(
+        cancel["references"],
+        format!("{} {}", name(&alert), name(&update))
+    );
 }
 
 #[test]
 fn foxglove_shows_the_fire_live() {
-    let Some(clients) = Clients::find() else { return };
-    let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let Some(clients) = Clients::find() else {
+        return;
+    };
+    let port = TcpListener::bind("127.0.0.1:0")
+        .unwrap()
+        .local_addr()
+        .unwrap()
+        .port();
     let station = Station::start(&format!("[foxglove]\nlisten = \"127.0.0.1:{port}\"\n"));
     station.tell(&fire());
     let has_fire = |seen: &Value| seen["topics"]["/fire/incidents"]["fixes"][0].is_object();
-    let seen = eventually(|| read(&clients, "foxglove", &format!("ws://127.0.0.1:{port}")), has_fire);
+    let seen = eventually(
+        || read(&clients, "foxglove", &format!("ws://127.0.0.1:{port}")),
+        has_fire,
+    );
     let fix = &seen["topics"]["/fire/incidents"]["fixes"][0];
     is_the_place(&fix["place"]);
     assert_eq!(fix["covariance"][8], 6.25);
@@ -131,17 +164,30 @@ fn foxglove_shows_the_fire_live() {
 }
 
 fn free_udp_port() -> u16 {
-    UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port()
+    UdpSocket::bind("127.0.0.1:0")
+        .unwrap()
+        .local_addr()
+        .unwrap()
+        .port()
 }
 
 #[test]
 fn a_marker_reaches_a_ground_station_program_and_ends_where_an_autopilot_answers() {
-    let Some(clients) = Clients::find() else { return };
+    let Some(clients) = Clients::find() else {
+        return;
+    };
     let port = free_udp_port();
     let station = Station::start(&format!("[adsb]\nurl = \"udpout:127.0.0.1:{port}\"\n"));
     station.tell(&fire());
     let mut gcs = clients.client("mav_ground.py");
-    gcs.args(["--port", &port.to_string(), "--seconds", "20", "--until", "traffic"]);
+    gcs.args([
+        "--port",
+        &port.to_string(),
+        "--seconds",
+        "20",
+        "--until",
+        "traffic",
+    ]);
     let (mut gcs, _) = Running::start(gcs, "ready ");
     let seen = gcs.wait().json();
     let marker = &seen["traffic"][0];
@@ -149,19 +195,34 @@ fn a_marker_reaches_a_ground_station_program_and_ends_where_an_autopilot_answers
     assert_eq!(marker["lat"], 314094222);
     assert_eq!(marker["lon"], 1191120167);
     assert_eq!(marker["altitude"], 8707, "mm above mean sea level");
-    assert_eq!(marker["from"], "1/191", "as the vehicle's own, or programs pass it over");
+    assert_eq!(
+        marker["from"], "1/191",
+        "as the vehicle's own, or programs pass it over"
+    );
     let icao = marker["ICAO_address"].as_u64().unwrap();
-    assert!((0x4000..0x9f_ffff).contains(&icao), "what MAVProxy draws: {icao:x}");
+    assert!(
+        (0x4000..0x9f_ffff).contains(&icao),
+        "what MAVProxy draws: {icao:x}"
+    );
 
     // A router may lead further than it seems: an autopilot's heartbeat comes back.
     let mut pilot = clients.client("mav_ground.py");
-    pilot.args(["--port", &port.to_string(), "--seconds", "5", "--as-autopilot"]);
+    pilot.args([
+        "--port",
+        &port.to_string(),
+        "--seconds",
+        "5",
+        "--as-autopilot",
+    ]);
     let (mut pilot, _) = Running::start(pilot, "ready ");
     let heard = pilot.wait().json()["traffic"].as_array().unwrap().len();
     assert!(heard <= 3, "it went on for {heard} s");
     let metrics = read(&clients, "metrics", &format!("{}/metrics", station.url));
     let samples = metrics["samples"].as_array().unwrap();
-    let stopped = samples.iter().find(|s| s["name"] == "emberfix_adsb_autopilots_heard").unwrap();
+    let stopped = samples
+        .iter()
+        .find(|s| s["name"] == "emberfix_adsb_autopilots_heard")
+        .unwrap();
     assert_eq!(stopped["value"], 1.0);
 }
 
@@ -181,9 +242,16 @@ fn readers(clients: &Clients, scratch: &Scratch, events: &[Value]) -> (Value, Op
         .stdout(Stdio::piped())
         .spawn()
         .unwrap();
-    node.stdin.take().unwrap().write_all(lines.as_bytes()).unwrap();
+    node.stdin
+        .take()
+        .unwrap()
+        .write_all(lines.as_bytes())
+        .unwrap();
     let said = node.wait_with_output().unwrap();
-    (takproto, Some(serde_json::from_slice(&said.stdout).unwrap()))
+    (
+        takproto,
+        Some(serde_json::from_slice(&said.stdout).unwrap()),
+    )
 }
 
 /// Until so many events have come: what a listener heard.
@@ -193,10 +261,14 @@ fn heard(listener: &mut Running) -> Vec<Value> {
 
 #[test]
 fn tak_sees_the_fire_over_multicast_and_over_tls_and_sees_it_go() {
-    let Some(clients) = Clients::find() else { return };
+    let Some(clients) = Clients::find() else {
+        return;
+    };
     let scratch = Scratch::new();
     let keys = scratch.path("keys");
-    clients.run("tak.py", ["certificates".as_ref(), keys.as_os_str()]).json();
+    clients
+        .run("tak.py", ["certificates".as_ref(), keys.as_os_str()])
+        .json();
     let mut relay = clients.client("tak.py");
     relay.args(["relay".as_ref(), keys.as_os_str()]);
     let (_relay, ready) = Running::start(relay, "ready ");
@@ -232,7 +304,10 @@ fn tak_sees_the_fire_over_multicast_and_over_tls_and_sees_it_go() {
     assert_eq!((&first["ce"], &first["le"]), (&json!(3.2), &json!(4.1)));
     assert_eq!(first["stale_s"], 600.0);
     let gone = takproto["events"].as_array().unwrap().last().unwrap();
-    assert_eq!((&gone["uid"], &gone["type"]), (&first["uid"], &json!("t-x-d-d")));
+    assert_eq!(
+        (&gone["uid"], &gone["type"]),
+        (&first["uid"], &json!("t-x-d-d"))
+    );
     if let Some(node) = node {
         let feature = &node["features"][0];
         assert_eq!(feature["id"], "emberfix.uav-1-7");
@@ -240,23 +315,44 @@ fn tak_sees_the_fire_over_multicast_and_over_tls_and_sees_it_go() {
         assert_eq!(feature["properties"]["marker-color"], "#FF0000");
         let icon = feature["properties"]["icon"].as_str().unwrap();
         assert!(icon.ends_with("/Google/firedept.png"), "{icon}");
-        assert_eq!(node["features"].as_array().unwrap().last().unwrap()["deletes"], true);
+        assert_eq!(
+            node["features"].as_array().unwrap().last().unwrap()["deletes"],
+            true
+        );
     }
 
     let over_tls = heard(&mut viewer);
-    let texts: Vec<&str> = over_tls.iter().map(|event| event.as_str().unwrap()).collect();
-    assert!(texts.iter().any(|text| text.contains("type=\"a-u-G\"")), "{texts:#?}");
-    assert!(texts.iter().any(|text| text.contains("type=\"t-x-d-d\"")), "{texts:#?}");
+    let texts: Vec<&str> = over_tls
+        .iter()
+        .map(|event| event.as_str().unwrap())
+        .collect();
+    assert!(
+        texts.iter().any(|text| text.contains("type=\"a-u-G\"")),
+        "{texts:#?}"
+    );
+    assert!(
+        texts.iter().any(|text| text.contains("type=\"t-x-d-d\"")),
+        "{texts:#?}"
+    );
 }
 
 #[test]
 fn a_tak_server_that_is_not_ours_is_refused_and_the_station_goes_on() {
-    let Some(clients) = Clients::find() else { return };
+    let Some(clients) = Clients::find() else {
+        return;
+    };
     let scratch = Scratch::new();
     let keys = scratch.path("keys");
-    clients.run("tak.py", ["certificates".as_ref(), keys.as_os_str()]).json();
+    clients
+        .run("tak.py", ["certificates".as_ref(), keys.as_os_str()])
+        .json();
     let mut relay = clients.client("tak.py");
-    relay.args(["relay".as_ref(), keys.as_os_str(), "--seconds".as_ref(), "4".as_ref()]);
+    relay.args([
+        "relay".as_ref(),
+        keys.as_os_str(),
+        "--seconds".as_ref(),
+        "4".as_ref(),
+    ]);
     let (mut relay, ready) = Running::start(relay, "ready ");
     let server = facts(&ready)["port"].to_string();
     let station = Station::start(&format!(
@@ -266,9 +362,16 @@ fn a_tak_server_that_is_not_ours_is_refused_and_the_station_goes_on() {
         keys.join("ground.key"),
     ));
     station.tell(&fire());
-    assert_eq!(relay.wait().json()["clients"], json!([]), "nothing was told to it");
+    assert_eq!(
+        relay.wait().json()["clients"],
+        json!([]),
+        "nothing was told to it"
+    );
     let metrics = read(&clients, "metrics", &format!("{}/metrics", station.url));
     let samples = metrics["samples"].as_array().unwrap();
-    let failed = samples.iter().find(|s| s["name"] == "emberfix_cot_failures_total").unwrap();
+    let failed = samples
+        .iter()
+        .find(|s| s["name"] == "emberfix_cot_failures_total")
+        .unwrap();
     assert!(failed["value"].as_f64().unwrap() >= 1.0, "{failed}");
 }

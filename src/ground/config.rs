@@ -1,6 +1,7 @@
 //! The ground station's configuration file: raw TOML to a checked [`GroundConfig`], every problem
 //! at once.
 
+use super::screens::config::{self as screens, RawScreens, ScreensConfig};
 use emberfix_calib::{KeyProblem, toml_problem, unknown_keys};
 use emberfix_mav::{LinkUrl, LinkUrlError};
 use serde::Deserialize;
@@ -51,7 +52,7 @@ pub struct Overrides {
 }
 
 /// A checked configuration.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct GroundConfig {
     pub(super) listen: SocketAddr,
     pub(super) host_names: Vec<String>,
@@ -59,6 +60,7 @@ pub struct GroundConfig {
     pub(super) exercise: bool,
     pub(super) mavlink: Option<MavlinkConfig>,
     pub(super) uavs: Vec<Uav>,
+    pub(super) screens: ScreensConfig,
 }
 
 /// The ground agent's end of MAVLink.
@@ -90,6 +92,8 @@ struct RawConfig {
     mavlink: Option<RawMavlink>,
     #[serde(default)]
     uav: Vec<RawUav>,
+    #[serde(flatten)]
+    screens: RawScreens,
 }
 
 #[derive(Deserialize)]
@@ -162,7 +166,7 @@ impl GroundConfig {
             })
         };
         let table: toml::Table = toml::from_str(text).map_err(syntax)?;
-        let mut problems: Vec<String> = unknown_keys(&table, KNOWN)
+        let mut problems: Vec<String> = unknown_keys(&table, &[KNOWN, screens::KNOWN].concat())
             .iter()
             .map(KeyProblem::to_string)
             .collect();
@@ -205,6 +209,8 @@ fn check(
     }
     let mavlink = mavlink.and_then(|link| check_mavlink(link, problems));
     let uavs = check_uavs(&raw.uav, problems);
+    let vehicle = mavlink.as_ref().map(|link| &link.url);
+    let screens = raw.screens.check(folder, vehicle, problems);
     Some(GroundConfig {
         listen: listen?,
         host_names: raw.host_names,
@@ -214,6 +220,7 @@ fn check(
             .unwrap_or_else(|| folder.join(raw.data_dir)),
         mavlink,
         uavs,
+        screens,
     })
 }
 

@@ -4,17 +4,23 @@
 //! |---|---|---|
 //! | `hello` | name of the store, the ground's clock; first on every stream | |
 //! | `alarm` | the alarm's GeoJSON Feature | row of the store |
+//! | `incident` | the incident's GeoJSON Feature | |
+//! | `gone` | `{"id", "into"}`: an incident that went into another | |
+//! | `upto` | `{"row"}`: everything up to this row has been told | the row |
 //! | `track` | an aircraft's [`super::Ping`] | |
 //! | `refused` | time, link and reason of an alarm that was not taken | |
 //! | `test` | time, link and aircraft of a test alarm, which is kept nowhere | |
 //! | `time` | the ground's clock, every [`PULSE`]: a client that misses it has lost the line | |
 //!
 //! A stream without `Last-Event-ID` begins with every incident as it stands now; with it, it tells
-//! each alarm since, in order. Each stream is a cursor into the store, so a slow client costs no
+//! each alarm since, in order. With `?show=incidents` a stream tells incidents instead of alarms: each
+//! as it is now, at most every [`GATHER`], so that a hundred screens do not cost a hundred times every
+//! revision. Each stream is a cursor into the store, so a slow client costs no
 //! memory and loses no alarm: it reads on where it was, or the door closes on it and it resumes.
 
 use super::store::{Row, Store, StoreError};
 use super::{Notice, Station, now};
+use crate::ground::incident;
 use axum::response::sse::Event;
 use std::convert::Infallible;
 use std::sync::Arc;
@@ -33,16 +39,33 @@ const PULSE: Duration = Duration::from_secs(5);
 const QUEUED: usize = 16;
 /// Rows read from the store at once.
 const PAGE: u32 = 128;
+/// What changes within this time is told to a screen at once.
+const GATHER: Duration = Duration::from_millis(200);
+
+/// What a stream tells of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum Show {
+    /// Every revision of every alarm.
+    #[default]
+    Alarms,
+    /// Incidents as they stand.
+    Incidents,
+}
 
 /// What a response body is made of.
 pub(super) type Events = ReceiverStream<Result<Event, Infallible>>;
 
 /// Opens a stream; `None` when there are too many.
-pub(super) fn open(station: &Arc<Station>, last_event_id: Option<i64>) -> Option<Events> {
+pub(super) fn open(
+    station: &Arc<Station>,
+    show: Show,
+    last_event_id: Option<i64>,
+) -> Option<Events> {
     let place = Place::take(Arc::clone(station))?;
     let (sender, receiver) = mpsc::channel(QUEUED);
     let stream = Stream {
-        cursor: Cursor::new(station, last_event_id),
+        cursor: Cursor::new(station, show, last_event_id),
         newest_row: station.rows(),
         notices: station.notices.subscribe(),
         stopping: station.stopping.subscribe(),
@@ -77,15 +100,21 @@ enum Cursor {
     Standing { after: i64, until: i64 },
     /// Telling what happens: every alarm in order.
     Following { after: i64 },
+    /// Telling incidents that changed after this row.
+    Incidents { after: i64 },
 }
 
 impl Cursor {
     /// An id beyond what we have is of another store: then all is told from the start.
-    fn new(station: &Station, last_event_id: Option<i64>) -> Self {
+    fn new(station: &Station, show: Show, last_event_id: Option<i64>) -> Self {
         let until = *station.rows().borrow();
-        match last_event_id {
-            Some(after) if (0..=until).contains(&after) => Self::Following { after },
-            _ => Self::Standing { after: 0, until },
+        let after = last_event_id.filter(|after| (0..=until).contains(after));
+        match (show, after) {
+            (Show::Alarms, Some(after)) => Self::Following { after },
+            (Show::Alarms, None) => Self::Standing { after: 0, until },
+            (Show::Incidents, after) => Self::Incidents {
+                after: after.unwrap_or(0),
+            },
         }
     }
 
@@ -97,6 +126,7 @@ impl Cursor {
                 let after = rows.last().map_or(after, |row| row.row);
                 Ok((rows, Self::Following { after }))
             }
+            Self::Incidents { .. } => Ok((Vec::new(), self)),
             Self::Standing { after, until } => {
                 let mut rows = store.latest_after(after, PAGE)?;
                 let more = rows.len() == PAGE as usize;
@@ -150,7 +180,7 @@ impl Stream {
             .latest()
             .filter_map(|p| serde_json::to_string(p).ok())
             .collect();
-        self.tell_alarms().await?;
+        self.tell_news().await?;
         for position in positions {
             self.tell(Event::default().event("track").data(position))
                 .await?;
@@ -158,7 +188,7 @@ impl Stream {
         let mut pulse = tokio::time::interval(PULSE);
         loop {
             match self.next(&mut pulse).await? {
-                News::Alarms => self.tell_alarms().await?,
+                News::Alarms => self.tell_news().await?,
                 News::Notice(notice) => {
                     self.tell(Event::default().event(notice.kind).data(&*notice.data))
                         .await?;
@@ -184,7 +214,34 @@ impl Stream {
         }
     }
 
-    /// Tells every alarm from the cursor to the end of the store.
+    /// Tells every incident that changed since the cursor, each as it is now.
+    async fn tell_incidents(&mut self, mut after: i64) -> Result<(), Ended> {
+        let until = *self.newest_row.borrow_and_update();
+        loop {
+            let news = self.place.0.incidents_since(after, PAGE as usize);
+            let Some(last) = news.last() else { break };
+            after = last.row();
+            for news in &news {
+                self.tell(told(news)).await?;
+            }
+        }
+        after = after.max(until);
+        self.cursor = Cursor::Incidents { after };
+        let data = serde_json::json!({ "row": after }).to_string();
+        let upto = Event::default().event("upto").id(after.to_string());
+        self.tell(upto.data(data)).await?;
+        tokio::time::sleep(GATHER).await;
+        Ok(())
+    }
+
+    /// Tells everything from the cursor to the end of the store.
+    async fn tell_news(&mut self) -> Result<(), Ended> {
+        match self.cursor {
+            Cursor::Incidents { after } => self.tell_incidents(after).await,
+            Cursor::Standing { .. } | Cursor::Following { .. } => self.tell_alarms().await,
+        }
+    }
+
     async fn tell_alarms(&mut self) -> Result<(), Ended> {
         self.newest_row.mark_unchanged();
         loop {
@@ -223,4 +280,16 @@ fn hello(station: &Station) -> Event {
 fn time() -> Event {
     let data = serde_json::json!({ "now": now().rfc3339() });
     Event::default().event("time").data(data.to_string())
+}
+
+fn told(news: &incident::News) -> Event {
+    match news {
+        incident::News::Changed(incident) => Event::default()
+            .event("incident")
+            .data(incident.to_geojson().to_string()),
+        incident::News::Gone { id, into, .. } => {
+            let data = serde_json::json!({ "id": id, "into": into });
+            Event::default().event("gone").data(data.to_string())
+        }
+    }
 }

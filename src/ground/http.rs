@@ -6,7 +6,7 @@
 
 mod incidents;
 
-use super::events::{self, MAX_STREAMS};
+use super::events::{self, MAX_STREAMS, Show};
 use super::store::{Completeness, Kept, StoreError};
 use super::tracks::Source;
 use super::{Ping, ReceiveError, Station, lock, now};
@@ -39,23 +39,8 @@ type Shared = State<Arc<Station>>;
 
 pub(super) fn router(station: Arc<Station>, host_names: Arc<[String]>) -> Router {
     Router::new()
-        .route(
-            "/",
-            get(|| page("text/html; charset=utf-8", include_str!("page/index.html"))),
-        )
-        .route(
-            "/app.js",
-            get(|| {
-                page(
-                    "text/javascript; charset=utf-8",
-                    include_str!("page/app.js"),
-                )
-            }),
-        )
-        .route(
-            "/style.css",
-            get(|| page("text/css; charset=utf-8", include_str!("page/style.css"))),
-        )
+        .merge(super::page::routes())
+        .merge(super::screens::routes())
         .route("/alarms", post(post_alarm))
         .route("/alarms/test", post(post_test))
         .route("/alarms.geojson", get(alarms))
@@ -78,11 +63,7 @@ pub(super) fn router(station: Arc<Station>, host_names: Arc<[String]>) -> Router
         .layer(middleware::map_response(guarded))
 }
 
-async fn page(kind: &'static str, text: &'static str) -> impl IntoResponse {
-    ([(header::CONTENT_TYPE, kind)], text)
-}
-
-fn refusal(status: StatusCode, reason: impl std::fmt::Display) -> Response {
+pub(super) fn refusal(status: StatusCode, reason: impl std::fmt::Display) -> Response {
     (status, axum::Json(json!({ "error": reason.to_string() }))).into_response()
 }
 
@@ -145,9 +126,11 @@ async fn guarded(mut response: Response) -> Response {
         (header::CACHE_CONTROL, "no-cache"),
     ];
     for (name, value) in HEADERS {
+        // The page itself brings a policy of its own.
         response
             .headers_mut()
-            .insert(name, HeaderValue::from_static(value));
+            .entry(name)
+            .or_insert(HeaderValue::from_static(value));
     }
     response
 }
@@ -303,6 +286,8 @@ fn geojson(text: String) -> Response {
 struct Resume {
     /// For clients that can't set the header.
     last_event_id: Option<i64>,
+    #[serde(default)]
+    show: Show,
 }
 
 async fn event_stream(
@@ -314,7 +299,7 @@ async fn event_stream(
     let last = header
         .and_then(|id| id.trim().parse().ok())
         .or(resume.last_event_id);
-    match events::open(&station, last) {
+    match events::open(&station, resume.show, last) {
         Some(events) => Sse::new(events)
             .keep_alive(KeepAlive::default())
             .into_response(),

@@ -35,6 +35,8 @@ pub mod incident;
 mod listener;
 mod mavlink;
 mod merge;
+mod page;
+mod screens;
 pub mod store;
 #[cfg(test)]
 mod tests;
@@ -44,6 +46,7 @@ mod writer;
 pub use chips::ChipError;
 pub use config::{ConfigError, GroundConfig, Overrides};
 pub use incident::{Incident, News};
+pub use screens::{CapError, TakError};
 pub use store::StoreError;
 pub use tracks::{Ping, PingError};
 pub use writer::{Done, Order, OrderError};
@@ -53,6 +56,7 @@ use board::Board;
 use chips::Chips;
 use emberfix_frames::{CovarianceError, ServiceTime};
 use emberfix_mav::{Link, LinkError};
+use screens::Screens;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -92,6 +96,19 @@ pub enum GroundError {
     /// The folder of images can't be opened.
     #[error(transparent)]
     Chips(#[from] ChipError),
+    /// CAP messages can't be kept.
+    #[error(transparent)]
+    Cap(#[from] CapError),
+    /// A TAK server can't be reached as configured.
+    #[error(transparent)]
+    Tak(#[from] TakError),
+    /// The Foxglove live view can't listen.
+    #[error("foxglove.listen: {source}")]
+    Foxglove {
+        /// What it said.
+        #[from]
+        source: foxglove::FoxgloveError,
+    },
     /// The MAVLink port can't be opened.
     #[error(transparent)]
     Mavlink(#[from] LinkError),
@@ -185,6 +202,7 @@ impl Ground {
             address: config.listen,
             source,
         };
+        screens::start(&station, config.screens).await?;
         let socket = tokio::net::TcpListener::bind(config.listen)
             .await
             .map_err(in_use)?;
@@ -261,6 +279,7 @@ pub(crate) struct Station {
     /// What stands, and the newest row of the journal; only ever what is on disk.
     published: Arc<Published>,
     chips: Arc<Mutex<Chips>>,
+    screens: Screens,
     tracks: Mutex<Tracks>,
     /// What is told once. Bound: [`NOTICES_QUEUED`]; loss: oldest first, per stream.
     notices: broadcast::Sender<Notice>,
@@ -289,6 +308,7 @@ impl Station {
             writer,
             published,
             chips,
+            screens: Screens::open(&config.screens, &config.data_dir)?,
             tracks: Mutex::default(),
             notices: broadcast::Sender::new(NOTICES_QUEUED),
             stopping: watch::Sender::new(false),

@@ -55,10 +55,16 @@ async fn index(State(station): State<Arc<Station>>) -> Response {
         "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; \
          img-src 'self' data: {tiles}; frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
     );
-    let mut response = ([(header::CONTENT_TYPE, HTML)], include_str!("page/index.html")).into_response();
+    let mut response = (
+        [(header::CONTENT_TYPE, HTML)],
+        include_str!("page/index.html"),
+    )
+        .into_response();
     // A configured origin was checked to be one, so this is always a header.
     if let Ok(policy) = HeaderValue::from_str(&policy) {
-        response.headers_mut().insert(header::CONTENT_SECURITY_POLICY, policy);
+        response
+            .headers_mut()
+            .insert(header::CONTENT_SECURITY_POLICY, policy);
     }
     response
 }

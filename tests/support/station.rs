@@ -28,7 +28,9 @@ impl Station {
         let mut command = emberfix();
         command.arg("ground").arg(&config);
         let (program, line) = Running::start(command, "http://");
-        let url = line.split_whitespace().find(|word| word.starts_with("http://"));
+        let url = line
+            .split_whitespace()
+            .find(|word| word.starts_with("http://"));
         Self {
             program,
             url: url.unwrap().to_owned(),
@@ -39,7 +41,10 @@ impl Station {
     /// An aircraft tells an alarm; when this returns, it is on the ground's disk.
     pub fn tell(&self, alarm: &Value) {
         let alarm = Alarm::from_geojson(alarm.to_string().as_bytes()).unwrap();
-        HttpLink::new(&self.url).unwrap().send_alarm(&alarm).unwrap();
+        HttpLink::new(&self.url)
+            .unwrap()
+            .send_alarm(&alarm)
+            .unwrap();
     }
 
     /// An operator does something.

@@ -5,10 +5,10 @@
 //! the configuration refuses the vehicle's port ([`super::config`]), and this ends for good, loudly,
 //! as soon as an autopilot is heard behind the endpoint: a router may lead further than it seems.
 
+use super::Incidents;
 use super::config::AdsbConfig;
 use super::view;
 use crate::ground::incident::Incident;
-use super::Incidents;
 use emberfix_frames::MslAltitude;
 use emberfix_mav::outgoing::companion_heartbeat;
 use emberfix_mav::telemetry::Heartbeat;
@@ -48,7 +48,13 @@ pub(super) async fn run(
     health: Arc<Health>,
 ) {
     let sender = Address::new(config.system_id, COMPONENT);
-    let agent = Agent { link, inbox: Inbox::new(), encoder: Encoder::new(sender), incidents, health };
+    let agent = Agent {
+        link,
+        inbox: Inbox::new(),
+        encoder: Encoder::new(sender),
+        incidents,
+        health,
+    };
     agent.run().await;
 }
 
@@ -83,7 +89,11 @@ impl Agent {
     async fn show(&mut self) {
         self.send(&companion_heartbeat(true)).await;
         let incidents = Arc::clone(&self.incidents.borrow());
-        for incident in incidents.iter().filter(|incident| view::is_open(incident)).take(MAX_MARKERS) {
+        for incident in incidents
+            .iter()
+            .filter(|incident| view::is_open(incident))
+            .take(MAX_MARKERS)
+        {
             self.send(&traffic_marker(&marker(incident))).await;
             self.health.sent.fetch_add(1, Ordering::Relaxed);
             tokio::time::sleep(GAP).await;
@@ -122,7 +132,14 @@ fn marker(incident: &Incident) -> TrafficMarker {
 
 /// The number at the end of an id, `uav-1-7` is 7, or else a hash of it; below 2^20.
 fn number(id: &str) -> u32 {
-    let digits = id.rsplit(|c: char| !c.is_ascii_digit()).next().unwrap_or_default();
-    let hash = || id.bytes().fold(2_166_136_261_u32, |hash, byte| (hash ^ u32::from(byte)).wrapping_mul(16_777_619));
+    let digits = id
+        .rsplit(|c: char| !c.is_ascii_digit())
+        .next()
+        .unwrap_or_default();
+    let hash = || {
+        id.bytes().fold(2_166_136_261_u32, |hash, byte| {
+            (hash ^ u32::from(byte)).wrapping_mul(16_777_619)
+        })
+    };
     digits.parse().unwrap_or_else(|_| hash()) & 0xf_ffff
 }

@@ -87,7 +87,9 @@ impl Kind {
     }
 
     pub(super) fn named(word: &str) -> Option<Self> {
-        [Self::Alert, Self::Update, Self::Cancel].into_iter().find(|kind| kind.word() == word)
+        [Self::Alert, Self::Update, Self::Cancel]
+            .into_iter()
+            .find(|kind| kind.word() == word)
     }
 }
 
@@ -123,12 +125,18 @@ impl Stood {
     }
 
     fn is_changed_since(&self, now: &Self) -> bool {
-        self.state != now.state || self.class != now.class || self.moved_m(now) > MOVED * self.ce90_m
+        self.state != now.state
+            || self.class != now.class
+            || self.moved_m(now) > MOVED * self.ce90_m
     }
 
     fn moved_m(&self, now: &Self) -> f64 {
         let place = |stood: &Self| {
-            place_from_degrees(stood.latitude_deg, stood.longitude_deg, EllipsoidHeight::from_m(0.0))
+            place_from_degrees(
+                stood.latitude_deg,
+                stood.longitude_deg,
+                EllipsoidHeight::from_m(0.0),
+            )
         };
         match (place(self), place(now)) {
             (Ok(before), Ok(after)) => enu_offset(&before, &after).xy().norm(),
@@ -149,8 +157,8 @@ pub(super) struct Issued {
 
 /// What should be issued now, if anything.
 pub(super) fn due(incident: &Incident, issued: Option<&Issued>, now: ServiceTime) -> Option<Kind> {
-    let is_certain =
-        incident.state != FireState::Suspected || incident.operator.state == OperatorState::Confirmed;
+    let is_certain = incident.state != FireState::Suspected
+        || incident.operator.state == OperatorState::Confirmed;
     let is_told = view::is_open(incident) && is_certain;
     let Some(issued) = issued else {
         return is_told.then_some(Kind::Alert);
@@ -204,14 +212,23 @@ pub(super) fn reference(sender: &str, identifier: &str, sent: ServiceTime) -> St
 
 /// A name that CAP allows: no white space, commas or markup.
 pub(super) fn token(text: &str) -> String {
-    let safe = |c: char| if c.is_ascii_alphanumeric() || matches!(c, '-' | '.' | '_') { c } else { '_' };
+    let safe = |c: char| {
+        if c.is_ascii_alphanumeric() || matches!(c, '-' | '.' | '_') {
+            c
+        } else {
+            '_'
+        }
+    };
     text.chars().map(safe).collect()
 }
 
 fn references(earlier: &[String]) -> Option<String> {
     let (first, rest) = earlier.split_first()?;
     let latest = &rest[rest.len().saturating_sub(MAX_REFERENCES - 1)..];
-    let all: Vec<&str> = std::iter::once(first).chain(latest).map(String::as_str).collect();
+    let all: Vec<&str> = std::iter::once(first)
+        .chain(latest)
+        .map(String::as_str)
+        .collect();
     Some(all.join(" "))
 }
 
@@ -243,7 +260,11 @@ fn info(kind: Kind, incident: &Incident, config: &CapConfig, now: ServiceTime) -
         (false, OperatorState::Confirmed) => ("Execute", "Immediate", "Severe"),
         (false, _) => ("Assess", "Immediate", "Unknown"),
     };
-    let onset = if is_over { None } else { Some(Element::leaf("onset", time(incident.first_seen_at))) };
+    let onset = if is_over {
+        None
+    } else {
+        Some(Element::leaf("onset", time(incident.first_seen_at)))
+    };
     Element::new("info")
         .field("language", "en")
         .field("category", "Fire")
@@ -255,7 +276,12 @@ fn info(kind: Kind, incident: &Incident, config: &CapConfig, now: ServiceTime) -
         .field("effective", time(now))
         .children(onset)
         .field("expires", time(now + HOLDS))
-        .children(config.sender_name.as_ref().map(|name| Element::leaf("senderName", name)))
+        .children(
+            config
+                .sender_name
+                .as_ref()
+                .map(|name| Element::leaf("senderName", name)),
+        )
         .field("headline", headline(kind, incident))
         .field("description", view::lines(incident).join(". "))
         .children(parameters(incident))
@@ -276,12 +302,24 @@ fn parameters(incident: &Incident) -> Vec<Element> {
         ("emberfix:le90_m", format!("{:.1}", incident.le90_m)),
         ("emberfix:confidence", format!("{:.2}", incident.confidence)),
         ("emberfix:captured_at", incident.captured_at.rfc3339()),
-        ("emberfix:height_ellipsoid_m", format!("{:.1}", incident.place.height().m())),
-        ("emberfix:altitude_msl_m", format!("{:.1}", incident.altitude_msl_m)),
+        (
+            "emberfix:height_ellipsoid_m",
+            format!("{:.1}", incident.place.height().m()),
+        ),
+        (
+            "emberfix:altitude_msl_m",
+            format!("{:.1}", incident.altitude_msl_m),
+        ),
     ];
-    parameters.extend(incident.aircraft().map(|uav| ("emberfix:uav", uav.to_owned())));
+    parameters.extend(
+        incident
+            .aircraft()
+            .map(|uav| ("emberfix:uav", uav.to_owned())),
+    );
     let element = |(name, value): (&'static str, String)| {
-        Element::new("parameter").field("valueName", name).field("value", value)
+        Element::new("parameter")
+            .field("valueName", name)
+            .field("value", value)
     };
     parameters.into_iter().map(element).collect()
 }
@@ -291,9 +329,15 @@ fn area(incident: &Incident, config: &CapConfig) -> Element {
     let fire_m = incident.size_m.map_or(0.0, |size| 0.5 * size.width);
     let radius_km = (config.radius_m + incident.ce90_m + fire_m) / 1000.0;
     Element::new("area")
-        .field("areaDesc", format_args!("{:.0} m around {lat:.5}, {lon:.5}", 1000.0 * radius_km))
+        .field(
+            "areaDesc",
+            format_args!("{:.0} m around {lat:.5}, {lon:.5}", 1000.0 * radius_km),
+        )
         .field("circle", format_args!("{lat:.6},{lon:.6} {radius_km:.3}"))
-        .field("altitude", format_args!("{:.0}", incident.altitude_msl_m * FEET_PER_METRE))
+        .field(
+            "altitude",
+            format_args!("{:.0}", incident.altitude_msl_m * FEET_PER_METRE),
+        )
 }
 
 /// CAP writes seconds without fraction, and UTC as `-00:00`, never `Z` (section 3.3.2).

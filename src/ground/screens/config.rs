@@ -12,9 +12,24 @@ use std::path::{Path, PathBuf};
 
 /// Keys of the tables below, for the check of unknown ones.
 pub(in crate::ground) const KNOWN: &[&str] = &[
-    "cot.url", "cot.profile", "cot.stale_s", "cot.interface", "cot.ca", "cot.certificate", "cot.key",
-    "cot.server_name", "cap.sender", "cap.sender_name", "cap.status", "cap.radius_m", "adsb.url",
-    "adsb.system_id", "foxglove.listen", "foxglove.allow_remote", "map.tiles", "map.attribution",
+    "cot.url",
+    "cot.profile",
+    "cot.stale_s",
+    "cot.interface",
+    "cot.ca",
+    "cot.certificate",
+    "cot.key",
+    "cot.server_name",
+    "cap.sender",
+    "cap.sender_name",
+    "cap.status",
+    "cap.radius_m",
+    "adsb.url",
+    "adsb.system_id",
+    "foxglove.listen",
+    "foxglove.allow_remote",
+    "map.tiles",
+    "map.attribution",
     "map.max_zoom",
 ];
 
@@ -102,7 +117,11 @@ impl RawScreens {
         problems: &mut Vec<String>,
     ) -> ScreensConfig {
         ScreensConfig {
-            cot: self.cot.into_iter().filter_map(|raw| raw.check(folder, problems)).collect(),
+            cot: self
+                .cot
+                .into_iter()
+                .filter_map(|raw| raw.check(folder, problems))
+                .collect(),
             cap: self.cap.and_then(|raw| raw.check(problems)),
             adsb: self.adsb.and_then(|raw| raw.check(vehicle, problems)),
             foxglove: self.foxglove.and_then(|raw| raw.check(problems)),
@@ -119,7 +138,11 @@ impl RawCot {
         }
         let profile = self.profile(problems)?;
         let endpoint = self.endpoint(folder, problems)?;
-        Some(TakConfig { endpoint, profile, stale_s })
+        Some(TakConfig {
+            endpoint,
+            profile,
+            stale_s,
+        })
     }
 
     fn profile(&self, problems: &mut Vec<String>) -> Option<Profile> {
@@ -127,7 +150,9 @@ impl RawCot {
             None | Some("marker") => Some(Profile::Marker),
             Some("semantic") => Some(Profile::Semantic),
             Some(other) => {
-                problems.push(format!("cot.profile is {other:?}, allowed are marker and semantic"));
+                problems.push(format!(
+                    "cot.profile is {other:?}, allowed are marker and semantic"
+                ));
                 None
             }
         }
@@ -144,16 +169,27 @@ impl RawCot {
         };
         match scheme {
             "udp" => match place.parse() {
-                Ok(to) => Some(Endpoint::Udp { to, interface: self.interface }),
+                Ok(to) => Some(Endpoint::Udp {
+                    to,
+                    interface: self.interface,
+                }),
                 Err(_) => {
-                    problems.push(format!("cot.url is {:?}, allowed behind udp:// is an IP address", self.url));
+                    problems.push(format!(
+                        "cot.url is {:?}, allowed behind udp:// is an IP address",
+                        self.url
+                    ));
                     None
                 }
             },
-            "tcp" => Some(Endpoint::Tcp { place: place.to_owned() }),
+            "tcp" => Some(Endpoint::Tcp {
+                place: place.to_owned(),
+            }),
             "tls" => self.tls(place.to_owned(), folder, problems),
             _ => {
-                problems.push(format!("cot.url is {:?}, allowed are udp://, tcp:// and tls://", self.url));
+                problems.push(format!(
+                    "cot.url is {:?}, allowed are udp://, tcp:// and tls://",
+                    self.url
+                ));
                 None
             }
         }
@@ -162,13 +198,21 @@ impl RawCot {
     fn tls(&self, place: String, folder: &Path, problems: &mut Vec<String>) -> Option<Endpoint> {
         let mut file = |key: &str, path: &Option<PathBuf>| {
             if path.is_none() {
-                problems.push(format!("cot.{key} is missing, a TAK server over TLS needs it: a PEM file"));
+                problems.push(format!(
+                    "cot.{key} is missing, a TAK server over TLS needs it: a PEM file"
+                ));
             }
             path.as_ref().map(|path| folder.join(path))
         };
-        let (ca, certificate, key) =
-            (file("ca", &self.ca), file("certificate", &self.certificate), file("key", &self.key));
-        let host = place.rsplit_once(':').map_or("", |(host, _)| host).to_owned();
+        let (ca, certificate, key) = (
+            file("ca", &self.ca),
+            file("certificate", &self.certificate),
+            file("key", &self.key),
+        );
+        let host = place
+            .rsplit_once(':')
+            .map_or("", |(host, _)| host)
+            .to_owned();
         let files = TlsFiles {
             ca: ca?,
             certificate: certificate?,
@@ -180,9 +224,9 @@ impl RawCot {
 }
 
 fn is_place(place: &str) -> bool {
-    place
-        .rsplit_once(':')
-        .is_some_and(|(host, port)| !host.is_empty() && port.parse::<u16>().is_ok_and(|port| port > 0))
+    place.rsplit_once(':').is_some_and(|(host, port)| {
+        !host.is_empty() && port.parse::<u16>().is_ok_and(|port| port > 0)
+    })
 }
 
 impl RawCap {
@@ -198,7 +242,9 @@ impl RawCap {
         }
         let radius_m = self.radius_m.unwrap_or(CAP_RADIUS_M);
         if !(10.0..=50_000.0).contains(&radius_m) {
-            problems.push(format!("cap.radius_m is {radius_m}, allowed is 10 to 50000"));
+            problems.push(format!(
+                "cap.radius_m is {radius_m}, allowed is 10 to 50000"
+            ));
         }
         let status = Status::named(&self.status);
         if status.is_none() {
@@ -239,9 +285,14 @@ impl RawAdsb {
         let system_id = self.system_id.unwrap_or(1);
         let id = u8::try_from(system_id).ok().filter(|id| *id > 0);
         if id.is_none() {
-            problems.push(format!("adsb.system_id is {system_id}, allowed is 1 to 255"));
+            problems.push(format!(
+                "adsb.system_id is {system_id}, allowed is 1 to 255"
+            ));
         }
-        Some(AdsbConfig { url, system_id: id? })
+        Some(AdsbConfig {
+            url,
+            system_id: id?,
+        })
     }
 }
 
@@ -252,7 +303,11 @@ fn leads_to_the_same(vehicle: &LinkUrl, place: &str) -> bool {
         LinkUrl::UdpIn(place) | LinkUrl::UdpOut(place) => place,
         LinkUrl::TcpIn(_) | LinkUrl::TcpOut(_) | LinkUrl::Serial { .. } => return false,
     };
-    let split = |place: &str| place.rsplit_once(':').map(|(host, port)| (host.to_owned(), port.to_owned()));
+    let split = |place: &str| {
+        place
+            .rsplit_once(':')
+            .map(|(host, port)| (host.to_owned(), port.to_owned()))
+    };
     match (split(vehicle), split(place)) {
         (Some((host, port)), Some((to, to_port))) => {
             port == to_port && (host == to || is_here(&host) && is_here(&to))
@@ -287,13 +342,20 @@ impl RawFoxglove {
 impl RawMap {
     fn check(self, folder: &Path, problems: &mut Vec<String>) -> Option<MapConfig> {
         let max_zoom = self.max_zoom.unwrap_or(19);
-        let zoom = u8::try_from(max_zoom).ok().filter(|zoom| (1..=24).contains(zoom));
+        let zoom = u8::try_from(max_zoom)
+            .ok()
+            .filter(|zoom| (1..=24).contains(zoom));
         if zoom.is_none() {
             problems.push(format!("map.max_zoom is {max_zoom}, allowed is 1 to 24"));
         }
-        MapConfig::new(&self.tiles, folder, self.attribution.unwrap_or_default(), zoom?)
-            .map_err(|problem| problems.push(problem))
-            .ok()
+        MapConfig::new(
+            &self.tiles,
+            folder,
+            self.attribution.unwrap_or_default(),
+            zoom?,
+        )
+        .map_err(|problem| problems.push(problem))
+        .ok()
     }
 }
 
@@ -316,21 +378,34 @@ mod tests {
 
     #[test]
     fn markers_never_go_where_the_vehicle_is() {
-        for url in ["udpout:127.0.0.1:14550", "udpout:localhost:14550", "udpin:127.0.0.1:14551"] {
+        for url in [
+            "udpout:127.0.0.1:14550",
+            "udpout:localhost:14550",
+            "udpin:127.0.0.1:14551",
+        ] {
             let (_, problems) = check(&format!("[adsb]\nurl='{url}'"));
             assert_eq!(problems.len(), 1, "{url}: {problems:?}");
         }
         for url in ["udpout:127.0.0.1:14551", "udpout:10.0.0.9:14550"] {
             let (config, problems) = check(&format!("[adsb]\nurl='{url}'"));
-            assert!(problems.is_empty() && config.adsb.is_some(), "{url}: {problems:?}");
+            assert!(
+                problems.is_empty() && config.adsb.is_some(),
+                "{url}: {problems:?}"
+            );
         }
     }
 
     #[test]
     fn a_tak_server_over_tls_needs_its_three_files() {
         let (_, problems) = check("[[cot]]\nurl='tls://tak.example:8089'\nca='ca.pem'");
-        assert!(problems.iter().any(|p| p.contains("cot.certificate")), "{problems:?}");
-        assert!(problems.iter().any(|p| p.contains("cot.key")), "{problems:?}");
+        assert!(
+            problems.iter().any(|p| p.contains("cot.certificate")),
+            "{problems:?}"
+        );
+        assert!(
+            problems.iter().any(|p| p.contains("cot.key")),
+            "{problems:?}"
+        );
     }
 
     #[test]
@@ -340,8 +415,20 @@ mod tests {
              [cap]\nsender='a b'\nstatus='real'\nradius_m=nan\n[foxglove]\nlisten='0.0.0.0:1'\n\
              [map]\ntiles='ftp://x'\nmax_zoom=99",
         );
-        for part in ["udp://tak", "\"x\"", "stale_s", "cap.sender", "cap.status", "radius_m", "allow_remote", "max_zoom"] {
-            assert!(problems.iter().any(|p| p.contains(part)), "{part} is not in {problems:#?}");
+        for part in [
+            "udp://tak",
+            "\"x\"",
+            "stale_s",
+            "cap.sender",
+            "cap.status",
+            "radius_m",
+            "allow_remote",
+            "max_zoom",
+        ] {
+            assert!(
+                problems.iter().any(|p| p.contains(part)),
+                "{part} is not in {problems:#?}"
+            );
         }
     }
 }

@@ -49,18 +49,27 @@ pub(super) fn uid(id: &str) -> String {
 
 /// The event that places or moves the marker.
 pub(super) fn event(incident: &Incident, telling: &Telling) -> String {
-    let how = if incident.aircraft().count() > 1 { "m-f" } else { "m-r" };
-    envelope(&uid(&incident.id), kind(incident, telling.profile), how, telling)
-        .child(
-            Element::new("point")
-                .with("lat", format_args!("{:.7}", incident.place.latitude_deg()))
-                .with("lon", format_args!("{:.7}", incident.place.longitude_deg()))
-                .with("hae", format_args!("{:.1}", incident.place.height().m()))
-                .with("ce", format_args!("{:.1}", incident.ce90_m))
-                .with("le", format_args!("{:.1}", incident.le90_m)),
-        )
-        .child(detail(incident))
-        .document()
+    let how = if incident.aircraft().count() > 1 {
+        "m-f"
+    } else {
+        "m-r"
+    };
+    envelope(
+        &uid(&incident.id),
+        kind(incident, telling.profile),
+        how,
+        telling,
+    )
+    .child(
+        Element::new("point")
+            .with("lat", format_args!("{:.7}", incident.place.latitude_deg()))
+            .with("lon", format_args!("{:.7}", incident.place.longitude_deg()))
+            .with("hae", format_args!("{:.1}", incident.place.height().m()))
+            .with("ce", format_args!("{:.1}", incident.ce90_m))
+            .with("le", format_args!("{:.1}", incident.le90_m)),
+    )
+    .child(detail(incident))
+    .document()
 }
 
 /// The event that takes the marker away.
@@ -123,7 +132,9 @@ fn detail(incident: &Incident) -> Element {
                 .with("altsrc", "CALC"),
         )
         .children(links)
-        .child(Element::leaf("remarks", view::lines(incident).join(". ")).with("source", "emberfix"))
+        .child(
+            Element::leaf("remarks", view::lines(incident).join(". ")).with("source", "emberfix"),
+        )
 }
 
 /// ARGB as the signed number that TAK wants: red burns, amber is not sure, grey is over.

@@ -4,8 +4,8 @@
 //! holds everything, so the next one makes good for it.
 
 use super::view;
-use crate::ground::incident::Incident;
 use crate::ground::Ping;
+use crate::ground::incident::Incident;
 use emberfix_frames::ServiceTime;
 use foxglove::messages::location_fix::PositionCovarianceType;
 use foxglove::messages::{GeoJson, LocationFix, LocationFixes, Timestamp};
@@ -49,10 +49,21 @@ impl Foxglove {
 
     /// Says how everything stands.
     pub(super) fn show(&self, incidents: &[Arc<Incident>], aircraft: &[Ping]) {
-        let shown = || incidents.iter().map(AsRef::as_ref).filter(|incident| view::is_shown(incident));
-        self.geojson.log(&GeoJson { geojson: features(shown()) });
-        self.fires.log(&LocationFixes { fixes: shown().map(fire).collect() });
-        self.aircraft.log(&LocationFixes { fixes: aircraft.iter().map(craft).collect() });
+        let shown = || {
+            incidents
+                .iter()
+                .map(AsRef::as_ref)
+                .filter(|incident| view::is_shown(incident))
+        };
+        self.geojson.log(&GeoJson {
+            geojson: features(shown()),
+        });
+        self.fires.log(&LocationFixes {
+            fixes: shown().map(fire).collect(),
+        });
+        self.aircraft.log(&LocationFixes {
+            fixes: aircraft.iter().map(craft).collect(),
+        });
     }
 }
 
@@ -67,7 +78,9 @@ impl Drop for Foxglove {
 
 /// The map panel draws points and polygons, and shows the properties.
 fn features<'i>(incidents: impl Iterator<Item = &'i Incident>) -> String {
-    let features: Vec<_> = incidents.flat_map(|incident| [feature(incident), ellipse(incident)]).collect();
+    let features: Vec<_> = incidents
+        .flat_map(|incident| [feature(incident), ellipse(incident)])
+        .collect();
     serde_json::json!({ "type": "FeatureCollection", "features": features }).to_string()
 }
 

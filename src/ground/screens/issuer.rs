@@ -75,11 +75,20 @@ impl Issuer {
     }
 
     /// Issues what is due; the number of messages.
-    pub(super) fn issue(&self, incidents: &[Arc<Incident>], now: ServiceTime) -> Result<usize, CapError> {
+    pub(super) fn issue(
+        &self,
+        incidents: &[Arc<Incident>],
+        now: ServiceTime,
+    ) -> Result<usize, CapError> {
         let mut kept = lock(&self.kept);
         let due: Vec<_> = incidents
             .iter()
-            .filter_map(|incident| Some((incident, cap::due(incident, kept.latest.get(&incident.id), now)?)))
+            .filter_map(|incident| {
+                Some((
+                    incident,
+                    cap::due(incident, kept.latest.get(&incident.id), now)?,
+                ))
+            })
             .collect();
         for (incident, kind) in &due {
             kept.issue(incident, *kind, &self.config, now)?;
@@ -91,36 +100,58 @@ impl Issuer {
     pub(super) fn message(&self, identifier: &str) -> Result<Option<String>, CapError> {
         let query = "SELECT xml FROM cap WHERE identifier = ?1";
         let kept = lock(&self.kept);
-        Ok(kept.database.query_row(query, [identifier], |row| row.get(0)).optional()?)
+        Ok(kept
+            .database
+            .query_row(query, [identifier], |row| row.get(0))
+            .optional()?)
     }
 
     /// Atom feed of the newest messages; `base` is where this station is reached.
     pub(super) fn feed(&self, base: &str, now: ServiceTime) -> Result<String, CapError> {
         let kept = lock(&self.kept);
-        let mut statement = kept.database.prepare_cached(
-            "SELECT identifier, title, sent FROM cap ORDER BY row DESC LIMIT ?1",
-        )?;
+        let mut statement = kept
+            .database
+            .prepare_cached("SELECT identifier, title, sent FROM cap ORDER BY row DESC LIMIT ?1")?;
         let entries: Vec<(String, String, String)> = statement
             .query_map([LISTED], |row| Ok((row.get(0)?, row.get(1)?, row.get(2)?)))?
             .collect::<Result<_, _>>()?;
-        let updated = entries.first().map_or_else(|| now.rfc3339(), |(_, _, sent)| sent.clone());
+        let updated = entries
+            .first()
+            .map_or_else(|| now.rfc3339(), |(_, _, sent)| sent.clone());
         let feed = Element::new("feed")
             .with("xmlns", "http://www.w3.org/2005/Atom")
             .field("id", format_args!("{base}/cap.atom"))
             .field("title", "Fires seen from the air")
             .field("updated", updated)
             .child(Element::new("author").field("name", &self.config.sender))
-            .child(Element::new("link").with("rel", "self").with("href", format_args!("{base}/cap.atom")))
+            .child(
+                Element::new("link")
+                    .with("rel", "self")
+                    .with("href", format_args!("{base}/cap.atom")),
+            )
             .children(entries.into_iter().map(|entry| feed_entry(base, entry)));
         Ok(feed.document())
     }
 }
 
 impl Kept {
-    fn issue(&mut self, incident: &Incident, kind: Kind, config: &CapConfig, now: ServiceTime) -> Result<(), CapError> {
-        let mut references = self.latest.get(&incident.id).map_or_else(Vec::new, |issued| issued.references.clone());
+    fn issue(
+        &mut self,
+        incident: &Incident,
+        kind: Kind,
+        config: &CapConfig,
+        now: ServiceTime,
+    ) -> Result<(), CapError> {
+        let mut references = self
+            .latest
+            .get(&incident.id)
+            .map_or_else(Vec::new, |issued| issued.references.clone());
         // A new Alert after a Cancel begins a new chain.
-        let earlier = if kind == Kind::Alert { &[] } else { &references[..] };
+        let earlier = if kind == Kind::Alert {
+            &[]
+        } else {
+            &references[..]
+        };
         let identifier = self.name(incident)?;
         let xml = cap::message(kind, incident, &identifier, earlier, config, now);
         let reference = cap::reference(&config.sender, &identifier, now);
@@ -143,14 +174,24 @@ impl Kept {
             references.clear();
         }
         references.push(reference);
-        self.latest.insert(incident.id.clone(), Issued { kind, sent: now, stood, references });
+        self.latest.insert(
+            incident.id.clone(),
+            Issued {
+                kind,
+                sent: now,
+                stood,
+                references,
+            },
+        );
         Ok(())
     }
 
     /// `<incident>.<number of the message>`: never given twice.
     fn name(&self, incident: &Incident) -> Result<String, CapError> {
         let query = "SELECT count(*) FROM cap WHERE incident = ?1";
-        let before: i64 = self.database.query_row(query, [&incident.id], |row| row.get(0))?;
+        let before: i64 = self
+            .database
+            .query_row(query, [&incident.id], |row| row.get(0))?;
         Ok(format!("{}.{}", cap::token(&incident.id), before + 1))
     }
 }
@@ -165,7 +206,9 @@ fn latest(database: &Connection) -> Result<BTreeMap<String, Issued>, CapError> {
         let (kind, sent): (String, String) = (row.get(1)?, row.get(2)?);
         let stood: String = row.get(3)?;
         let kind = Kind::named(&kind).unwrap_or(Kind::Update);
-        let mut references = latest.remove(&incident).map_or_else(Vec::new, |issued| issued.references);
+        let mut references = latest
+            .remove(&incident)
+            .map_or_else(Vec::new, |issued| issued.references);
         if kind == Kind::Alert {
             references.clear();
         }

@@ -35,14 +35,26 @@ pub(super) fn network_link(base: &str) -> String {
         .field("name", "Fires")
         .field("open", 1)
         .child(link);
-    kml(Element::new("Document").field("name", "emberfix").child(network_link))
+    kml(Element::new("Document")
+        .field("name", "emberfix")
+        .child(network_link))
 }
 
 /// Everything as it stands.
-pub(super) fn document(incidents: &[Arc<Incident>], aircraft: &[Ping], base: &str, now: ServiceTime) -> String {
+pub(super) fn document(
+    incidents: &[Arc<Incident>],
+    aircraft: &[Ping],
+    base: &str,
+    now: ServiceTime,
+) -> String {
     let shown = incidents.iter().filter(|incident| view::is_shown(incident));
-    let fires = Element::new("Folder").field("name", "Fires").field("open", 1).children(shown.map(|incident| placemark(incident)));
-    let craft = Element::new("Folder").field("name", "Aircraft").children(aircraft.iter().map(craft));
+    let fires = Element::new("Folder")
+        .field("name", "Fires")
+        .field("open", 1)
+        .children(shown.map(|incident| placemark(incident)));
+    let craft = Element::new("Folder")
+        .field("name", "Aircraft")
+        .children(aircraft.iter().map(craft));
     kml(Element::new("Document")
         .field("name", format_args!("Fires at {}", second(now)))
         .children(STYLES.iter().map(|style| self::style(style, base)))
@@ -51,7 +63,10 @@ pub(super) fn document(incidents: &[Arc<Incident>], aircraft: &[Ping], base: &st
 }
 
 fn kml(document: Element) -> String {
-    Element::new("kml").with("xmlns", NAMESPACE).child(document).document()
+    Element::new("kml")
+        .with("xmlns", NAMESPACE)
+        .child(document)
+        .document()
 }
 
 fn style((name, line, fill): &(&str, &str, &str), base: &str) -> Element {
@@ -60,7 +75,11 @@ fn style((name, line, fill): &(&str, &str, &str), base: &str) -> Element {
         .with("id", name)
         .child(Element::new("IconStyle").field("scale", "1.1").child(icon))
         .child(Element::new("LabelStyle").field("scale", "0.9"))
-        .child(Element::new("LineStyle").field("color", line).field("width", 2))
+        .child(
+            Element::new("LineStyle")
+                .field("color", line)
+                .field("width", 2),
+        )
         .child(Element::new("PolyStyle").field("color", fill))
 }
 
@@ -75,14 +94,18 @@ fn style_of(incident: &Incident) -> &'static str {
 /// Point and ellipse in one placemark: one balloon, one entry in the viewer's list.
 fn placemark(incident: &Incident) -> Element {
     let [longitude, latitude, _] = incident.coordinates();
-    let coordinates =
-        format!("{longitude:.8},{latitude:.8},{:.2}", incident.altitude_msl_m);
+    let coordinates = format!(
+        "{longitude:.8},{latitude:.8},{:.2}",
+        incident.altitude_msl_m
+    );
     let point = Element::new("Point")
         .field("altitudeMode", "absolute")
         .field("coordinates", coordinates);
-    let shapes = Element::new("MultiGeometry")
-        .child(point)
-        .children(Some(view::ellipse90(incident, CORNERS)).filter(|c| c.len() > 2).map(|c| polygon(&c)));
+    let shapes = Element::new("MultiGeometry").child(point).children(
+        Some(view::ellipse90(incident, CORNERS))
+            .filter(|c| c.len() > 2)
+            .map(|c| polygon(&c)),
+    );
     Element::new("Placemark")
         .with("id", super::cap::token(&incident.id))
         .field("name", view::callsign(incident))
@@ -105,19 +128,25 @@ fn data(incident: &Incident) -> Element {
         ("confidence", format!("{:.2}", incident.confidence)),
         ("ce90_m", format!("{:.1}", incident.ce90_m)),
         ("le90_m", format!("{:.1}", incident.le90_m)),
-        ("height_ellipsoid_m", format!("{:.1}", incident.place.height().m())),
+        (
+            "height_ellipsoid_m",
+            format!("{:.1}", incident.place.height().m()),
+        ),
         ("captured_at", incident.captured_at.rfc3339()),
     ];
     let value = |(name, value): (&'static str, String)| {
-        Element::new("Data").with("name", name).field("value", value)
+        Element::new("Data")
+            .with("name", name)
+            .field("value", value)
     };
     Element::new("ExtendedData").children(values.into_iter().map(value))
 }
 
 fn polygon(corners: &[[f64; 2]]) -> Element {
     let closed = corners.iter().chain(corners.first());
-    let coordinates: Vec<String> =
-        closed.map(|[lon, lat]| format!("{lon:.8},{lat:.8}")).collect();
+    let coordinates: Vec<String> = closed
+        .map(|[lon, lat]| format!("{lon:.8},{lat:.8}"))
+        .collect();
     let ring = Element::new("LinearRing").field("coordinates", coordinates.join(" "));
     Element::new("Polygon")
         .field("tessellate", 1)
@@ -129,7 +158,10 @@ fn craft(ping: &Ping) -> Element {
     let coordinates = format!("{:.7},{:.7}", ping.longitude_deg, ping.latitude_deg);
     Element::new("Placemark")
         .field("name", &ping.uav)
-        .field("description", format_args!("{}, last heard {}", ping.health, second(ping.at)))
+        .field(
+            "description",
+            format_args!("{}, last heard {}", ping.health, second(ping.at)),
+        )
         .field("styleUrl", "#uav")
         .child(Element::new("Point").field("coordinates", coordinates))
 }

@@ -40,9 +40,15 @@ pub(super) struct Family<'p> {
 
 impl Family<'_> {
     pub(super) fn sample(&mut self, labels: &[(&str, &str)], value: impl Display) -> &mut Self {
-        let labels: Vec<String> =
-            labels.iter().map(|(name, value)| format!("{name}=\"{}\"", escaped(value))).collect();
-        let braces = if labels.is_empty() { String::new() } else { format!("{{{}}}", labels.join(",")) };
+        let labels: Vec<String> = labels
+            .iter()
+            .map(|(name, value)| format!("{name}=\"{}\"", escaped(value)))
+            .collect();
+        let braces = if labels.is_empty() {
+            String::new()
+        } else {
+            format!("{{{}}}", labels.join(","))
+        };
         let _ = writeln!(self.page.text, "{}{braces} {value}", self.name);
         self
     }
@@ -50,7 +56,10 @@ impl Family<'_> {
 
 /// Label values escape three characters.
 fn escaped(value: &str) -> String {
-    value.replace('\\', "\\\\").replace('"', "\\\"").replace('\n', "\\n")
+    value
+        .replace('\\', "\\\\")
+        .replace('"', "\\\"")
+        .replace('\n', "\\n")
 }
 
 /// Memory of this process that is in RAM, bytes.
@@ -67,7 +76,9 @@ mod tests {
     #[test]
     fn a_label_can_not_begin_a_line_of_its_own() {
         let mut page = Page::default();
-        page.family("x", Kind::Gauge, "An x.").sample(&[("uav", "a\"\n\\b")], 1.5).sample(&[], 2);
+        page.family("x", Kind::Gauge, "An x.")
+            .sample(&[("uav", "a\"\n\\b")], 1.5)
+            .sample(&[], 2);
         assert_eq!(
             page.into_text(),
             "# HELP x An x.\n# TYPE x gauge\nx{uav=\"a\\\"\\n\\\\b\"} 1.5\nx 2\n"

@@ -61,8 +61,16 @@ pub(super) struct Screens {
 impl Screens {
     /// Opens what is on disk; starts nothing.
     pub(super) fn open(config: &ScreensConfig, data_dir: &Path) -> Result<Self, CapError> {
-        let cap = config.cap.clone().map(|cap| Issuer::open(cap, data_dir)).transpose()?;
-        let tak = config.cot.iter().map(|tak| (tak.endpoint.to_string(), Arc::default())).collect();
+        let cap = config
+            .cap
+            .clone()
+            .map(|cap| Issuer::open(cap, data_dir))
+            .transpose()?;
+        let tak = config
+            .cot
+            .iter()
+            .map(|tak| (tak.endpoint.to_string(), Arc::default()))
+            .collect();
         Ok(Self {
             incidents: watch::Sender::new(Arc::from([])),
             cap: cap.map(Arc::new),
@@ -79,7 +87,10 @@ impl Screens {
 }
 
 /// Starts every screen that sends of its own accord.
-pub(super) async fn start(station: &Arc<Station>, config: ScreensConfig) -> Result<(), GroundError> {
+pub(super) async fn start(
+    station: &Arc<Station>,
+    config: ScreensConfig,
+) -> Result<(), GroundError> {
     let screens = &station.screens;
     for (tak, (_, health)) in config.cot.into_iter().zip(&screens.tak) {
         let tak = Tak::new(tak, screens.incidents.subscribe(), Arc::clone(health))?;
@@ -87,14 +98,22 @@ pub(super) async fn start(station: &Arc<Station>, config: ScreensConfig) -> Resu
     }
     if let (Some(adsb), Some(health)) = (config.adsb, &screens.adsb) {
         let link = emberfix_mav::Link::open(&adsb.url).await?;
-        let run = adsb::run(adsb, link, screens.incidents.subscribe(), Arc::clone(health));
+        let run = adsb::run(
+            adsb,
+            link,
+            screens.incidents.subscribe(),
+            Arc::clone(health),
+        );
         tokio::spawn(until_stopped(Arc::clone(station), run));
     }
     let foxglove = match config.foxglove {
         Some(listen) => Some(foxglove::Foxglove::start(listen).await?),
         None => None,
     };
-    tokio::spawn(until_stopped(Arc::clone(station), keep_up(Arc::clone(station), foxglove)));
+    tokio::spawn(until_stopped(
+        Arc::clone(station),
+        keep_up(Arc::clone(station), foxglove),
+    ));
     Ok(())
 }
 
@@ -136,7 +155,10 @@ async fn show(station: &Arc<Station>, incidents: Incidents, foxglove: Option<&fo
         foxglove.show(&incidents, &aircraft(station));
     }
     station.screens.incidents.send_if_modified(|known| {
-        let is_news = known.iter().map(|old| old.row).ne(incidents.iter().map(|new| new.row));
+        let is_news = known
+            .iter()
+            .map(|old| old.row)
+            .ne(incidents.iter().map(|new| new.row));
         *known = incidents;
         is_news
     });

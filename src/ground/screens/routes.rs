@@ -33,12 +33,17 @@ fn answer(kind: &'static str, text: String) -> Response {
 
 /// Where the asker reached this station: the name was checked to be ours.
 fn base(headers: &HeaderMap) -> String {
-    let host = headers.get(header::HOST).and_then(|host| host.to_str().ok());
+    let host = headers
+        .get(header::HOST)
+        .and_then(|host| host.to_str().ok());
     format!("http://{}", host.unwrap_or("localhost"))
 }
 
 async fn network_link(headers: HeaderMap) -> Response {
-    answer("application/vnd.google-earth.kml+xml", kml::network_link(&base(&headers)))
+    answer(
+        "application/vnd.google-earth.kml+xml",
+        kml::network_link(&base(&headers)),
+    )
 }
 
 async fn incidents(State(station): Shared, headers: HeaderMap) -> Response {
@@ -65,7 +70,10 @@ async fn message(State(station): Shared, Path(name): Path<String>) -> Response {
     };
     match cap.message(name.strip_suffix(".xml").unwrap_or(&name)) {
         Ok(Some(xml)) => answer("application/cap+xml", xml),
-        Ok(None) => refusal(StatusCode::NOT_FOUND, "no such message was issued; see /cap.atom"),
+        Ok(None) => refusal(
+            StatusCode::NOT_FOUND,
+            "no such message was issued; see /cap.atom",
+        ),
         Err(error) => refusal(StatusCode::SERVICE_UNAVAILABLE, error),
     }
 }
@@ -98,31 +106,54 @@ async fn metrics(State(station): Shared) -> Response {
 
 fn incidents_in(page: &mut Page, incidents: &[Arc<Incident>]) {
     let open = incidents.iter().filter(|incident| view::is_open(incident));
-    let unseen = open.clone().filter(|incident| incident.operator.state == OperatorState::New).count();
+    let unseen = open
+        .clone()
+        .filter(|incident| incident.operator.state == OperatorState::New)
+        .count();
     let open = open.count();
-    page.family("emberfix_incidents", Kind::Gauge, "Incidents, by whether they still burn.")
-        .sample(&[("state", "open")], open)
-        .sample(&[("state", "closed")], incidents.len() - open);
-    page.family("emberfix_incidents_unacknowledged", Kind::Gauge, "Open incidents that nobody has seen.")
-        .sample(&[], unseen);
+    page.family(
+        "emberfix_incidents",
+        Kind::Gauge,
+        "Incidents, by whether they still burn.",
+    )
+    .sample(&[("state", "open")], open)
+    .sample(&[("state", "closed")], incidents.len() - open);
+    page.family(
+        "emberfix_incidents_unacknowledged",
+        Kind::Gauge,
+        "Open incidents that nobody has seen.",
+    )
+    .sample(&[], unseen);
 }
 
 fn station_in(page: &mut Page, station: &Station) {
     let read = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
     let counters = &station.counters;
-    page.family("emberfix_alarms_total", Kind::Counter, "Alarm revisions that came, by what became of them.")
-        .sample(&[("result", "stored")], read(&counters.stored))
-        .sample(&[("result", "repeated")], read(&counters.repeated))
-        .sample(&[("result", "refused")], read(&counters.refused));
+    page.family(
+        "emberfix_alarms_total",
+        Kind::Counter,
+        "Alarm revisions that came, by what became of them.",
+    )
+    .sample(&[("result", "stored")], read(&counters.stored))
+    .sample(&[("result", "repeated")], read(&counters.repeated))
+    .sample(&[("result", "refused")], read(&counters.refused));
     page.family("emberfix_event_streams", Kind::Gauge, "Open event streams.")
         .sample(&[], read(&counters.streams));
-    let mut heard =
-        page.family("emberfix_aircraft_heard_timestamp_seconds", Kind::Gauge, "When an aircraft last said where it is.");
+    let mut heard = page.family(
+        "emberfix_aircraft_heard_timestamp_seconds",
+        Kind::Gauge,
+        "When an aircraft last said where it is.",
+    );
     for ping in aircraft(station) {
         heard.sample(&[("uav", &ping.uav)], ping.at.unix_ns() as f64 * 1e-9);
     }
     if let Some(bytes) = resident_bytes() {
-        page.family("process_resident_memory_bytes", Kind::Gauge, "Memory in use.").sample(&[], bytes);
+        page.family(
+            "process_resident_memory_bytes",
+            Kind::Gauge,
+            "Memory in use.",
+        )
+        .sample(&[], bytes);
     }
     page.family("emberfix_build_info", Kind::Gauge, "Which program this is.")
         .sample(&[("version", env!("CARGO_PKG_VERSION"))], 1);
@@ -131,22 +162,45 @@ fn station_in(page: &mut Page, station: &Station) {
 fn screens_in(page: &mut Page, station: &Station) {
     let read = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
     let screens = &station.screens;
-    let mut connected = page.family("emberfix_cot_connected", Kind::Gauge, "Whether a TAK receiver is reached.");
+    let mut connected = page.family(
+        "emberfix_cot_connected",
+        Kind::Gauge,
+        "Whether a TAK receiver is reached.",
+    );
     for (to, health) in &screens.tak {
-        connected.sample(&[("to", to)], u8::from(health.connected.load(Ordering::Relaxed)));
+        connected.sample(
+            &[("to", to)],
+            u8::from(health.connected.load(Ordering::Relaxed)),
+        );
     }
-    let mut sent = page.family("emberfix_cot_events_total", Kind::Counter, "Events told to a TAK receiver.");
+    let mut sent = page.family(
+        "emberfix_cot_events_total",
+        Kind::Counter,
+        "Events told to a TAK receiver.",
+    );
     for (to, health) in &screens.tak {
         sent.sample(&[("to", to)], read(&health.sent));
     }
-    let mut failed =
-        page.family("emberfix_cot_failures_total", Kind::Counter, "Times that a TAK receiver was lost or not reached.");
+    let mut failed = page.family(
+        "emberfix_cot_failures_total",
+        Kind::Counter,
+        "Times that a TAK receiver was lost or not reached.",
+    );
     for (to, health) in &screens.tak {
         failed.sample(&[("to", to)], read(&health.failed));
     }
     if let Some(health) = &screens.adsb {
-        page.family("emberfix_adsb_markers_total", Kind::Counter, "Markers sent.").sample(&[], read(&health.sent));
-        page.family("emberfix_adsb_autopilots_heard", Kind::Gauge, "1: an autopilot is behind the port, and sending has ended.")
-            .sample(&[], read(&health.refused));
+        page.family(
+            "emberfix_adsb_markers_total",
+            Kind::Counter,
+            "Markers sent.",
+        )
+        .sample(&[], read(&health.sent));
+        page.family(
+            "emberfix_adsb_autopilots_heard",
+            Kind::Gauge,
+            "1: an autopilot is behind the port, and sending has ended.",
+        )
+        .sample(&[], read(&health.refused));
     }
 }

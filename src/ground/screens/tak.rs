@@ -4,8 +4,8 @@
 //! heard ([`Told`]). **Loss.** A datagram may get lost; everything is said again every
 //! [`REPEAT_S`]. A stream that breaks is dialled anew, and then told everything that stands.
 
-use super::cot::{self, Profile, Telling};
 use super::Incidents;
+use super::cot::{self, Profile, Telling};
 use super::told::{Rhythm, Told, Word};
 use crate::ground::now;
 use emberfix_frames::{ServiceTime, SignedDuration};
@@ -132,7 +132,12 @@ impl Tak {
             Endpoint::Tls { files, .. } => Some(connector(files)?),
             Endpoint::Udp { .. } | Endpoint::Tcp { .. } => None,
         };
-        Ok(Self { config, tls, incidents, health })
+        Ok(Self {
+            config,
+            tls,
+            incidents,
+            health,
+        })
     }
 
     pub(super) async fn run(mut self) {
@@ -143,7 +148,11 @@ impl Tak {
             let Err(error) = attempt else { return };
             self.health.failed.fetch_add(1, Ordering::Relaxed);
             tracing::warn!(%error, to = %self.config.endpoint, "a TAK receiver is not reached");
-            pause = if was_connected { BACK_OFF.0 } else { (pause * 2).min(BACK_OFF.1) };
+            pause = if was_connected {
+                BACK_OFF.0
+            } else {
+                (pause * 2).min(BACK_OFF.1)
+            };
             sleep(pause).await;
         }
     }
@@ -184,7 +193,10 @@ impl Tak {
         }
     }
 
-    async fn tell_stream(&mut self, stream: impl AsyncRead + AsyncWrite + Send) -> std::io::Result<()> {
+    async fn tell_stream(
+        &mut self,
+        stream: impl AsyncRead + AsyncWrite + Send,
+    ) -> std::io::Result<()> {
         let (mut reader, mut writer) = tokio::io::split(stream);
         self.health.connected.store(true, Ordering::Relaxed);
         let mut told = Told::default();
@@ -294,19 +306,25 @@ async fn open_udp(to: SocketAddr, interface: Option<Ipv4Addr>) -> std::io::Resul
 fn connector(files: &TlsFiles) -> Result<(TlsConnector, ServerName<'static>), TakError> {
     let mut roots = RootCertStore::empty();
     for certificate in certificates(&files.ca)? {
-        roots.add(certificate).map_err(|error| bad(&files.ca, error))?;
+        roots
+            .add(certificate)
+            .map_err(|error| bad(&files.ca, error))?;
     }
     let key = PrivateKeyDer::from_pem_file(&files.key).map_err(|error| bad(&files.key, error))?;
     let provider = Arc::new(tokio_rustls::rustls::crypto::ring::default_provider());
-    let identity = |source| TakError::Identity { path: files.certificate.clone(), source };
+    let identity = |source| TakError::Identity {
+        path: files.certificate.clone(),
+        source,
+    };
     let config = ClientConfig::builder_with_provider(provider)
         .with_safe_default_protocol_versions()
         .map_err(identity)?
         .with_root_certificates(roots)
         .with_client_auth_cert(certificates(&files.certificate)?, key)
         .map_err(identity)?;
-    let name = ServerName::try_from(files.server_name.clone())
-        .map_err(|_| TakError::Name { name: files.server_name.clone() })?;
+    let name = ServerName::try_from(files.server_name.clone()).map_err(|_| TakError::Name {
+        name: files.server_name.clone(),
+    })?;
     Ok((TlsConnector::from(Arc::new(config)), name))
 }
 
@@ -321,5 +339,8 @@ fn certificates(path: &Path) -> Result<Vec<CertificateDer<'static>>, TakError> {
 }
 
 fn bad(path: &Path, reason: impl std::fmt::Display) -> TakError {
-    TakError::File { path: path.to_owned(), reason: reason.to_string() }
+    TakError::File {
+        path: path.to_owned(),
+        reason: reason.to_string(),
+    }
 }

@@ -33,7 +33,11 @@ fn incident(row: i64, operator: OperatorState, change: impl FnOnce(&mut Alarm)) 
         by: (operator != OperatorState::New).then(|| "Ana".to_owned()),
         ..Operator::default()
     };
-    let part = Part { alarm: &alarm, operator: &operator, aircraft_knows: None };
+    let part = Part {
+        alarm: &alarm,
+        operator: &operator,
+        aircraft_knows: None,
+    };
     let about = Circumstances {
         id: alarm.properties.id.clone(),
         row,
@@ -69,7 +73,11 @@ fn a_receiver_hears_news_once_and_the_rest_now_and_then() {
     assert!(words(&mut told, &first, at(1)).is_empty());
     let second = [incident(2, OperatorState::New, |_| {})];
     assert_eq!(words(&mut told, &second, at(2)), ["stands"]);
-    assert_eq!(words(&mut told, &second, at(62)), ["stands"], "who came later sees it too");
+    assert_eq!(
+        words(&mut told, &second, at(62)),
+        ["stands"],
+        "who came later sees it too"
+    );
 }
 
 #[test]
@@ -78,28 +86,53 @@ fn what_is_dismissed_or_merged_is_taken_off_the_map_even_after_a_restart() {
     words(&mut told, &[incident(1, OperatorState::New, |_| {})], at(0));
     let dismissed = [incident(2, OperatorState::Dismissed, |_| {})];
     assert_eq!(words(&mut told, &dismissed, at(5)), ["gone"]);
-    assert_eq!(words(&mut told, &dismissed, at(6)), ["gone"], "a datagram may be lost");
+    assert_eq!(
+        words(&mut told, &dismissed, at(6)),
+        ["gone"],
+        "a datagram may be lost"
+    );
     assert!(words(&mut told, &dismissed, at(7)).is_empty());
     let back = [incident(3, OperatorState::Acknowledged, |_| {})];
-    assert_eq!(words(&mut told, &back, at(8)), ["stands"], "the dismissal was taken back");
-    assert_eq!(words(&mut told, &[], at(9)), ["gone"], "it went into another incident");
+    assert_eq!(
+        words(&mut told, &back, at(8)),
+        ["stands"],
+        "the dismissal was taken back"
+    );
+    assert_eq!(
+        words(&mut told, &[], at(9)),
+        ["gone"],
+        "it went into another incident"
+    );
 
     let mut anew = Told::default();
-    assert_eq!(words(&mut anew, &dismissed, at(10)), ["gone"], "somebody may still show it");
+    assert_eq!(
+        words(&mut anew, &dismissed, at(10)),
+        ["gone"],
+        "somebody may still show it"
+    );
     assert!(words(&mut anew.clone(), &dismissed, at(700)).len() <= 1);
-    assert!(words(&mut Told::default(), &dismissed, at(700)).is_empty(), "its marker has gone stale");
+    assert!(
+        words(&mut Told::default(), &dismissed, at(700)).is_empty(),
+        "its marker has gone stale"
+    );
 }
 
 #[test]
 fn what_has_gone_out_is_shown_a_while_and_then_let_go_stale() {
-    let out = [incident(1, OperatorState::New, |alarm| alarm.properties.state = FireState::Out)];
+    let out = [incident(1, OperatorState::New, |alarm| {
+        alarm.properties.state = FireState::Out
+    })];
     assert_eq!(words(&mut Told::default(), &out, at(10)), ["stands"]);
     assert!(words(&mut Told::default(), &out, at(601)).is_empty());
 }
 
 #[test]
 fn an_event_keeps_its_uid_and_its_deletion_names_it() {
-    let telling = Telling { profile: Profile::Marker, now: at(0), stale: SignedDuration::from_secs(600) };
+    let telling = Telling {
+        profile: Profile::Marker,
+        now: at(0),
+        stale: SignedDuration::from_secs(600),
+    };
     let event = cot::event(&incident(1, OperatorState::New, |_| {}), &telling);
     for part in [
         "uid=\"emberfix.uav-1-7\"",
@@ -114,35 +147,70 @@ fn an_event_keeps_its_uid_and_its_deletion_names_it() {
         assert!(event.contains(part), "{part} is not in {event}");
     }
     let deletion = cot::deletion("uav-1-7", &telling);
-    assert!(deletion.contains("type=\"t-x-d-d\"") && deletion.contains("<__forcedelete/>"), "{deletion}");
+    assert!(
+        deletion.contains("type=\"t-x-d-d\"") && deletion.contains("<__forcedelete/>"),
+        "{deletion}"
+    );
     assert_eq!(deletion.matches("emberfix.uav-1-7").count(), 2);
 }
 
 fn issued(kind: Kind, incident: &Incident, sent: ServiceTime) -> Issued {
-    Issued { kind, sent, stood: Stood::of(incident), references: vec!["a,b,c".to_owned()] }
+    Issued {
+        kind,
+        sent,
+        stood: Stood::of(incident),
+        references: vec!["a,b,c".to_owned()],
+    }
 }
 
 #[test]
 fn cap_tells_what_is_news_and_no_more() {
     let new = incident(1, OperatorState::New, |_| {});
     assert_eq!(cap::due(&new, None, at(0)), Some(Kind::Alert));
-    let suspected = incident(1, OperatorState::New, |alarm| alarm.properties.state = FireState::Suspected);
+    let suspected = incident(1, OperatorState::New, |alarm| {
+        alarm.properties.state = FireState::Suspected
+    });
     assert_eq!(cap::due(&suspected, None, at(0)), None, "not yet");
     let dismissed = incident(2, OperatorState::Dismissed, |_| {});
-    assert_eq!(cap::due(&dismissed, None, at(0)), None, "nobody was told of it");
+    assert_eq!(
+        cap::due(&dismissed, None, at(0)),
+        None,
+        "nobody was told of it"
+    );
 
     let alert = issued(Kind::Alert, &new, at(0));
     assert_eq!(cap::due(&new, Some(&alert), at(30)), None);
-    let growing = incident(3, OperatorState::New, |alarm| alarm.properties.state = FireState::Growing);
-    assert_eq!(cap::due(&growing, Some(&alert), at(30)), None, "at most once a minute");
+    let growing = incident(3, OperatorState::New, |alarm| {
+        alarm.properties.state = FireState::Growing
+    });
+    assert_eq!(
+        cap::due(&growing, Some(&alert), at(30)),
+        None,
+        "at most once a minute"
+    );
     assert_eq!(cap::due(&growing, Some(&alert), at(61)), Some(Kind::Update));
     let confirmed = incident(4, OperatorState::Confirmed, |_| {});
-    assert_eq!(cap::due(&confirmed, Some(&alert), at(1)), Some(Kind::Update), "a person said so");
-    assert_eq!(cap::due(&dismissed, Some(&alert), at(1)), Some(Kind::Cancel));
-    assert_eq!(cap::due(&new, Some(&alert), at(1_801)), Some(Kind::Update), "or it would expire");
+    assert_eq!(
+        cap::due(&confirmed, Some(&alert), at(1)),
+        Some(Kind::Update),
+        "a person said so"
+    );
+    assert_eq!(
+        cap::due(&dismissed, Some(&alert), at(1)),
+        Some(Kind::Cancel)
+    );
+    assert_eq!(
+        cap::due(&new, Some(&alert), at(1_801)),
+        Some(Kind::Update),
+        "or it would expire"
+    );
     let cancel = issued(Kind::Cancel, &dismissed, at(2));
     assert_eq!(cap::due(&dismissed, Some(&cancel), at(3)), None);
-    assert_eq!(cap::due(&new, Some(&cancel), at(4)), Some(Kind::Alert), "the dismissal was taken back");
+    assert_eq!(
+        cap::due(&new, Some(&cancel), at(4)),
+        Some(Kind::Alert),
+        "the dismissal was taken back"
+    );
 }
 
 #[test]
@@ -172,7 +240,11 @@ fn an_ellipse_at_the_date_line_and_an_aircraft_with_a_strange_name_make_sound_km
         alarm.properties.uav = "<b>&\u{7}".to_owned();
     });
     assert_eq!(view::ellipse90(&far, 16).len(), 16);
-    assert!(view::ellipse90(&far, 16).iter().all(|[lon, _]| (-180.0..=180.0).contains(lon)));
+    assert!(
+        view::ellipse90(&far, 16)
+            .iter()
+            .all(|[lon, _]| (-180.0..=180.0).contains(lon))
+    );
     let text = kml::document(&[far], &[], "http://localhost", at(0));
     assert!(!text.contains("<b>") && !text.contains('\u{7}'), "{text}");
 }

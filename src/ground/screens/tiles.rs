@@ -24,9 +24,22 @@ const MAX_TILE: u64 = 2 * 1024 * 1024;
 
 impl MapConfig {
     /// `tiles` is a folder, or a template such as `https://tiles.example/{z}/{x}/{y}.png`.
-    pub(super) fn new(tiles: &str, folder: &Path, attribution: String, max_zoom: u8) -> Result<Self, String> {
-        let source = if tiles.contains("://") { server(tiles)? } else { Source::Folder(folder.join(tiles)) };
-        Ok(Self { source, attribution, max_zoom })
+    pub(super) fn new(
+        tiles: &str,
+        folder: &Path,
+        attribution: String,
+        max_zoom: u8,
+    ) -> Result<Self, String> {
+        let source = if tiles.contains("://") {
+            server(tiles)?
+        } else {
+            Source::Folder(folder.join(tiles))
+        };
+        Ok(Self {
+            source,
+            attribution,
+            max_zoom,
+        })
     }
 
     /// What the page needs to know.
@@ -70,12 +83,17 @@ fn server(template: &str) -> Result<Source, String> {
     let (scheme, rest) = template.split_once("://").ok_or_else(refused)?;
     let (host, path) = rest.split_once('/').ok_or_else(refused)?;
     let is_host = !host.is_empty()
-        && host.chars().all(|c| c.is_ascii_alphanumeric() || matches!(c, '.' | '-' | ':'));
+        && host
+            .chars()
+            .all(|c| c.is_ascii_alphanumeric() || matches!(c, '.' | '-' | ':'));
     let has_all = ["{z}", "{x}", "{y}"].iter().all(|part| path.contains(part));
     if !matches!(scheme, "http" | "https") || !is_host || !has_all {
         return Err(refused());
     }
-    Ok(Source::Server { template: template.to_owned(), origin: format!("{scheme}://{host}") })
+    Ok(Source::Server {
+        template: template.to_owned(),
+        origin: format!("{scheme}://{host}"),
+    })
 }
 
 #[cfg(test)]

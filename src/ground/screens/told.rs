@@ -62,7 +62,9 @@ impl Told {
         let absent = self.by_id.iter().filter(|(id, last)| {
             !standing.contains(id.as_str()) && last.farewells < rhythm.farewells
         });
-        words.chain(absent.map(|(id, _)| Word::Gone(id.clone()))).collect()
+        words
+            .chain(absent.map(|(id, _)| Word::Gone(id.clone())))
+            .collect()
     }
 
     fn word(&self, incident: &Arc<Incident>, now: ServiceTime, rhythm: Rhythm) -> Option<Word> {
@@ -84,11 +86,19 @@ impl Told {
     pub(super) fn said(&mut self, word: &Word, now: ServiceTime) {
         match word {
             Word::Stands(incident) => {
-                let last = Last { row: incident.row, at: now, farewells: 0 };
+                let last = Last {
+                    row: incident.row,
+                    at: now,
+                    farewells: 0,
+                };
                 self.by_id.insert(incident.id.clone(), last);
             }
             Word::Gone(id) => {
-                let last = self.by_id.entry(id.clone()).or_insert(Last { row: 0, at: now, farewells: 0 });
+                let last = self.by_id.entry(id.clone()).or_insert(Last {
+                    row: 0,
+                    at: now,
+                    farewells: 0,
+                });
                 last.farewells = last.farewells.saturating_add(1);
             }
         }
@@ -99,7 +109,10 @@ impl Told {
         if self.by_id.len() <= 2 * MAX_TOLD {
             return;
         }
-        let standing: BTreeSet<&str> = incidents.iter().map(|incident| incident.id.as_str()).collect();
+        let standing: BTreeSet<&str> = incidents
+            .iter()
+            .map(|incident| incident.id.as_str())
+            .collect();
         self.by_id
             .retain(|id, last| standing.contains(id.as_str()) || last.farewells < rhythm.farewells);
     }

@@ -19,7 +19,11 @@ pub(super) fn is_open(incident: &Incident) -> bool {
 
 /// When something last happened to it: an aircraft saw it, or a person said something.
 pub(super) fn changed_at(incident: &Incident) -> ServiceTime {
-    let said = incident.operator.at.as_deref().and_then(ServiceTime::from_rfc3339);
+    let said = incident
+        .operator
+        .at
+        .as_deref()
+        .and_then(ServiceTime::from_rfc3339);
     said.map_or(incident.captured_at, |said| said.max(incident.captured_at))
 }
 
@@ -38,7 +42,11 @@ pub(super) fn title(incident: &Incident) -> String {
         AlarmClass::Fire => "Fire",
         AlarmClass::Smoke => "Smoke",
     };
-    format!("{}{kind}, {}", exercise(incident), state_word(incident.state))
+    format!(
+        "{}{kind}, {}",
+        exercise(incident),
+        state_word(incident.state)
+    )
 }
 
 fn exercise(incident: &Incident) -> &'static str {
@@ -55,14 +63,27 @@ pub(super) fn lines(incident: &Incident) -> Vec<String> {
             100.0 * incident.confidence,
             operator_words(incident)
         ),
-        format!("CE90 {:.1} m, LE90 {:.1} m (90 % of cases)", incident.ce90_m, incident.le90_m),
-        format!("Last seen {} by {}", second(incident.captured_at), seen_by.join(", ")),
+        format!(
+            "CE90 {:.1} m, LE90 {:.1} m (90 % of cases)",
+            incident.ce90_m, incident.le90_m
+        ),
+        format!(
+            "Last seen {} by {}",
+            second(incident.captured_at),
+            seen_by.join(", ")
+        ),
     ];
     if let Some(size) = incident.size_m {
-        lines.push(format!("{:.1} m wide, {:.1} m high", size.width, size.height));
+        lines.push(format!(
+            "{:.1} m wide, {:.1} m high",
+            size.width, size.height
+        ));
     }
     if !incident.degraded.is_empty() {
-        lines.push(format!("Less sure because of: {}", incident.degraded.join(", ")));
+        lines.push(format!(
+            "Less sure because of: {}",
+            incident.degraded.join(", ")
+        ));
     }
     lines
 }

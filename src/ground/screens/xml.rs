@@ -44,8 +44,7 @@ impl Element {
 
     /// Adds all; an `Option` is none or one.
     pub(super) fn children(mut self, children: impl IntoIterator<Item = Self>) -> Self {
-        self.content
-            .extend(children.into_iter().map(Node::Element));
+        self.content.extend(children.into_iter().map(Node::Element));
         self
     }
 
@@ -109,7 +108,9 @@ mod tests {
     #[test]
     fn what_an_aircraft_calls_itself_can_not_break_out() {
         let name = "a\"><evil/>&\u{1}\u{ffff}";
-        let element = Element::new("craft").with("name", name).child(Element::leaf("name", name));
+        let element = Element::new("craft")
+            .with("name", name)
+            .child(Element::leaf("name", name));
         assert_eq!(
             element.to_string(),
             "<craft name=\"a&quot;&gt;&lt;evil/&gt;&amp;\u{fffd}\u{fffd}\">\
