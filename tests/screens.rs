@@ -13,8 +13,8 @@ mod support;
 use clients::{Clients, Running, facts};
 use serde_json::{Value, json};
 use station::{Station, eventually, fire};
-use std::io::Write;
-use std::net::{TcpListener, UdpSocket};
+use std::io::{BufRead, BufReader, Write};
+use std::net::{TcpListener, TcpStream, UdpSocket};
 use std::process::{Command, Stdio};
 use support::{Scratch, root};
 
@@ -275,7 +275,7 @@ fn tak_sees_the_fire_over_multicast_and_over_tls_and_sees_it_go() {
     let server = facts(&ready)["port"].to_string();
     let mut viewer = clients.client("tak.py");
     viewer.args(["pytak".as_ref(), keys.as_os_str()]);
-    viewer.args(["--port", &server, "--count", "3"]);
+    viewer.args(["--port", &server, "--count", "2"]);
     let (mut viewer, _) = Running::start(viewer, "ready ");
     // A group of our own: others on this network may use TAK's.
     let group = format!("239.2.3.1:{}", free_udp_port());
@@ -374,4 +374,63 @@ fn a_tak_server_that_is_not_ours_is_refused_and_the_station_goes_on() {
         .find(|s| s["name"] == "emberfix_cot_failures_total")
         .unwrap();
     assert!(failed["value"].as_f64().unwrap() >= 1.0, "{failed}");
+}
+
+/// Events of a stream up to and with the first of a kind: names and data, and the last id.
+fn events(station: &Station, after: Option<&str>, until: &str) -> (Vec<(String, Value)>, String) {
+    let address = station.url.strip_prefix("http://").unwrap();
+    let mut stream = TcpStream::connect(address).unwrap();
+    let resume = after.map_or_else(String::new, |id| format!("last-event-id: {id}\r\n"));
+    write!(
+        stream,
+        "GET /events?show=incidents HTTP/1.1\r\nhost: {address}\r\n{resume}\r\n"
+    )
+    .unwrap();
+    let (mut told, mut id, mut kind) = (Vec::new(), String::new(), String::new());
+    for line in BufReader::new(stream).lines().map_while(Result::ok) {
+        match line.split_once(": ").or(line.split_once(':')) {
+            Some(("event", name)) => kind = name.to_owned(),
+            Some(("id", number)) => id = number.to_owned(),
+            Some(("data", data)) => told.push((kind.clone(), serde_json::from_str(data).unwrap())),
+            // An event ends with an empty line: its id stands by then.
+            _ if line.is_empty() && kind == until => break,
+            _ => {}
+        }
+    }
+    (told, id)
+}
+
+#[test]
+fn a_screen_that_comes_back_is_told_what_it_missed_and_no_more() {
+    let station = Station::start("");
+    station.tell(&fire());
+    let (told, id) = events(&station, None, "upto");
+    let names = |told: &[(String, Value)]| -> Vec<String> {
+        told.iter()
+            .filter(|(kind, _)| kind == "incident")
+            .map(|(_, f)| f["id"].to_string())
+            .collect()
+    };
+    assert_eq!(names(&told), ["\"uav-1-7\""]);
+    let (told, same) = events(&station, Some(&id), "upto");
+    assert_eq!(
+        (names(&told), &same),
+        (Vec::new(), &id),
+        "nothing has happened since"
+    );
+
+    station.act(ID, "acknowledge");
+    let mut other = fire();
+    other["properties"]["id"] = "uav-1-8".into();
+    other["geometry"]["coordinates"][0] = 119.113.into();
+    station.tell(&other);
+    let (told, newer) = events(&station, Some(&id), "upto");
+    assert_eq!(names(&told), ["\"uav-1-7\"", "\"uav-1-8\""]);
+    assert_eq!(
+        told[1].1["properties"]["operator"]["by"], "Ana",
+        "{told:#?}"
+    );
+    assert!(newer.parse::<i64>().unwrap() > id.parse::<i64>().unwrap());
+    let (told, _) = events(&station, Some("999999"), "upto");
+    assert_eq!(names(&told).len(), 2, "an id of another store: all is told");
 }
