@@ -124,8 +124,7 @@ fn trusted_alone(
     Ok((found, Methods::only(voice.method)))
 }
 
-/// Mean by information. They look at the same pixels, so together they know no more than they do on
-/// average.
+/// Mean by information. They look at the same pixels, so their errors are taken to be one.
 fn weighed(voices: &[Voice]) -> (Disparity, Methods) {
     let weight = |voice: &Voice| voice.found.sigma_px.powi(-2);
     let sum: f64 = voices.iter().map(weight).sum();
@@ -139,7 +138,8 @@ fn weighed(voices: &[Voice]) -> (Disparity, Methods) {
         .fold(Methods::default(), Methods::with);
     let found = Disparity {
         px: mean(|found| found.px),
-        sigma_px: (voices.len() as f64 / sum).sqrt(),
+        // Wholly correlated errors: the mean's is the mean of theirs.
+        sigma_px: mean(|found| found.sigma_px),
         // Each voice speaks of its own rows, so their mean speaks of the mean row.
         centroid: RectifiedPixel {
             u: mean(|found| found.centroid.u),

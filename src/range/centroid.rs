@@ -8,8 +8,8 @@
 use super::correlate::{disparity, rival_free};
 use super::patch::{Area, Gray};
 use super::refine::Refined;
-use super::scene::{Mask, Scene};
-use super::search::correlate;
+use super::scene::{Mask, Run, Scene};
+use super::search::{correlate, rows_apart};
 use super::{Disparity, RangeConfig, Refusal};
 
 /// Grey levels between which a pixel comes to count.
@@ -50,9 +50,10 @@ pub(super) fn find(scene: &Scene<'_>, config: &RangeConfig) -> Result<Disparity,
         return Err(Refusal::TooSmall);
     }
     let offsets = (-scene.search.greatest)..=(-scene.search.least);
-    let curve = correlate(&left, &right, &bright.grown(RIM_PX).runs(), offsets);
+    let rimmed = bright.grown(RIM_PX).runs();
+    let curve = correlate(&left, &right, &rimmed, rows_apart(&rimmed), offsets);
     let best = rival_free(&curve, LEAST_LIKENESS, -scene.search.greatest)?;
-    let bands = bands(&left, &right, &bright, best.at);
+    let bands = bands(&left, &right, &rimmed, best.at);
     let (px, sigma_px) = scatter(&bands).ok_or(Refusal::TooSmall)?;
     let refined = Refined {
         disparity_px: px,
@@ -111,15 +112,14 @@ struct Band {
     disparity_px: f64,
 }
 
-fn bands(left: &Gray, right: &Gray, bright: &Mask, offset: i32) -> Vec<Band> {
-    let runs = bright.grown(RIM_PX).runs();
+fn bands(left: &Gray, right: &Gray, runs: &[Run], offset: i32) -> Vec<Band> {
     let (Some(first), Some(last)) = (runs.first(), runs.last()) else {
         return Vec::new();
     };
     let rows = (last.row - first.row + 1) as usize;
     let count = (rows / 2).clamp(1, BANDS);
     let mut sums = vec![[0.0_f64; 4]; count];
-    for run in &runs {
+    for run in runs {
         let from = run.from.max(right.seen.0 - offset).max(left.seen.0);
         let to = run.to.min(right.seen.1 - offset).min(left.seen.1);
         let band = (run.row - first.row) as usize * count / rows;

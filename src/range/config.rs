@@ -131,7 +131,7 @@ impl Default for RangeConfig {
             pre_filter_cap: 31,
             context_px: 16,
             min_support: 12,
-            min_agreement: 0.4,
+            min_agreement: 0.5,
             min_correlation: 0.6,
             sigma_floor_px: 0.02,
             max_sigma_over_range: 0.35,

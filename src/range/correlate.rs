@@ -3,7 +3,7 @@
 
 use super::refine::{Refined, Refiner};
 use super::scene::{Mask, Run, Scene};
-use super::search::{Curve, Peak, correlate};
+use super::search::{Curve, Peak, correlate, rows_apart};
 use super::{Disparity, Miss, RangeConfig, Refusal};
 use emberfix_calib::RectifiedPixel;
 
@@ -34,13 +34,14 @@ pub(super) fn find(scene: &Scene<'_>, config: &RangeConfig) -> Result<Correlated
         return Err(Refusal::TooSmall.into());
     }
     let outlined = scene.flame.grown(OUTLINE_PX).runs();
+    let every = rows_apart(&outlined);
     let offsets = (-scene.search.greatest)..=(-scene.search.least);
-    let curve = correlate(&scene.left.gray, &scene.right, &outlined, offsets);
+    let curve = correlate(&scene.left.gray, &scene.right, &outlined, every, offsets);
     let peak = rival_free(&curve, config.min_correlation, -scene.search.greatest)?;
-    there_and_back(scene, &outlined, &peak)?;
+    there_and_back(scene, &outlined, every, &peak)?;
     let right = scene.opposite(peak.at)?;
-    let rim = scene.flame.grown(RIM_PX).runs();
-    let refined = Refiner::new(&scene.left.gray, &right, &rim, -peak.at)
+    let weights = scene.weights(RIM_PX);
+    let refined = Refiner::new(&scene.left.gray, &right, &weights, -peak.at)
         .and_then(|refiner| refiner.refine())
         .ok_or(Refusal::Inconsistent)?;
     let unlike = 1.0 + UNLIKE * (1.0 - peak.correlation);
@@ -71,7 +72,7 @@ pub(super) fn rival_free(curve: &Curve, least: f64, nearest: i32) -> Result<Peak
 }
 
 /// What the right eye shows there must match best where it came from.
-fn there_and_back(scene: &Scene<'_>, runs: &[Run], peak: &Peak) -> Result<(), Miss> {
+fn there_and_back(scene: &Scene<'_>, runs: &[Run], every: i32, peak: &Peak) -> Result<(), Miss> {
     let moved: Vec<Run> = runs
         .iter()
         .map(|run| Run {
@@ -81,8 +82,8 @@ fn there_and_back(scene: &Scene<'_>, runs: &[Run], peak: &Peak) -> Result<(), Mi
         })
         .filter(|run| run.from < run.to)
         .collect();
-    let back = scene.back(peak.at)?;
-    let curve = correlate(&scene.right, &back, &moved, scene.search.all());
+    let back = scene.back(peak.at, every)?;
+    let curve = correlate(&scene.right, &back, &moved, every, scene.search.all());
     match curve.peaks().first() {
         Some(found) if (found.at + peak.at).abs() <= BACK_PX => Ok(()),
         _ => Err(Refusal::OneSided.into()),

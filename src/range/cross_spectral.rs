@@ -35,7 +35,8 @@ pub(super) fn find(scene: &Scene<'_>, config: &RangeConfig) -> Result<Disparity,
         gradient(&scene.left.gray),
         gradient(&scene.opposite(best.at)?),
     );
-    let refined = Refiner::new(&left, &right, &runs, -best.at)
+    let weights = scene.weights(OUTLINE_PX);
+    let refined = Refiner::new(&left, &right, &weights, -best.at)
         .and_then(|refiner| refiner.refine())
         .ok_or(Refusal::Inconsistent)?;
     Ok(disparity(&scene.flame, &refined, 1.0))

@@ -65,6 +65,7 @@ impl Default for HsvMask {
     }
 }
 
+#[inline]
 fn hsv(red: f64, green: f64, blue: f64) -> (f64, f64, f64) {
     let value = red.max(green).max(blue);
     let spread = value - red.min(green).min(blue);

@@ -174,13 +174,27 @@ impl Cutter {
     }
 
     /// The left eye over an area in gray, each place as its nearest pixel: enough to find whole pixels.
-    pub fn left_draft(&self, image: &Mat, area: Area) -> Result<Gray, RangeError> {
+    /// Only rows `every` apart are filled.
+    pub fn left_draft(&self, image: &Mat, area: Area, every: i32) -> Result<Gray, RangeError> {
         let area = area.within_rows(self.size().1);
         let raw = Raw::<3>::of(image)?;
         let mut values = Vec::with_capacity(area.width() * area.height());
-        let seen = self.each_place(Eye::Left, area, |u, v| {
-            values.push(luma(&raw.nearest(u, v)))
-        });
+        let mut seen = (area.left, area.right);
+        for row in area.top..area.bottom {
+            if row % every == 0 {
+                let line = Area {
+                    top: row,
+                    bottom: row + 1,
+                    ..area
+                };
+                let here = self.each_place(Eye::Left, line, |u, v| {
+                    values.push(luma(&raw.nearest(u, v)))
+                });
+                seen = (seen.0.max(here.0), seen.1.min(here.1));
+            } else {
+                values.resize(values.len() + area.width(), 0.0);
+            }
+        }
         Ok(Gray { area, seen, values })
     }
 
@@ -325,8 +339,8 @@ impl<'a, const N: usize> Raw<'a, N> {
     }
 
     fn nearest(&self, u: f32, v: f32) -> [u8; N] {
-        let column = ((u + 0.5).max(0.0) as usize).min(self.columns - 1);
-        let row = ((v + 0.5).max(0.0) as usize).min(self.rows - 1);
+        let column = ((u + 0.5).max(0.0) as i32 as usize).min(self.columns - 1);
+        let row = ((v + 0.5).max(0.0) as i32 as usize).min(self.rows - 1);
         self.pixels[row * self.columns + column]
     }
 
@@ -357,13 +371,13 @@ impl Raw<'_, 1> {
     fn linear(&self, u: f32, v: f32) -> f32 {
         let u = u.clamp(0.0, (self.columns - 1) as f32);
         let v = v.clamp(0.0, (self.rows - 1) as f32);
-        let (column, row) = (u as usize, v as usize);
+        let (column, row) = (u as i32 as usize, v as i32 as usize);
         let (right, below) = (
             (column + 1).min(self.columns - 1),
             (row + 1).min(self.rows - 1),
         );
         let at = |column: usize, row: usize| f32::from(self.pixels[row * self.columns + column][0]);
-        let (s, t) = (u.fract(), v.fract());
+        let (s, t) = (u - column as f32, v - row as f32);
         let upper = at(column, row) * (1.0 - s) + at(right, row) * s;
         let lower = at(column, below) * (1.0 - s) + at(right, below) * s;
         upper * (1.0 - t) + lower * t
@@ -384,28 +398,39 @@ impl Crop {
     fn cubic(&self, u: f32, v: f32) -> f32 {
         let u = (u - self.left).clamp(0.0, (self.columns - 1) as f32);
         let v = (v - self.top).clamp(0.0, (self.rows - 1) as f32);
-        let (across, down) = (cubic(u.fract()), cubic(v.fract()));
-        let (column, row) = (u as usize, v as usize);
+        // Signed, because the processor converts those at once.
+        let (column, row) = (u as i32 as usize, v as i32 as usize);
+        let (across, down) = (cubic(u - column as f32), cubic(v - row as f32));
         let inside = column >= 1 && column + 2 < self.columns && row >= 1 && row + 2 < self.rows;
-        let mut sum = 0.0;
-        for (k, weight) in down.into_iter().enumerate() {
-            let line = if inside {
-                let first = (row + k - 1) * self.columns + column - 1;
-                let taps = &self.values[first..first + 4];
-                across[0] * taps[0]
-                    + across[1] * taps[1]
-                    + across[2] * taps[2]
-                    + across[3] * taps[3]
-            } else {
-                let row = (row + k).saturating_sub(1).min(self.rows - 1);
-                let at = |j: usize| {
-                    let column = (column + j).saturating_sub(1).min(self.columns - 1);
-                    self.values[row * self.columns + column]
-                };
-                (0..4).map(|j| across[j] * at(j)).sum()
-            };
-            sum += weight * line;
+        if !inside {
+            return self.cubic_at_edge((column, row), across, down);
         }
+        let first = (row - 1) * self.columns + column - 1;
+        let line = |k: usize| {
+            let first = first + k * self.columns;
+            let taps = &self.values[first..first + 4];
+            across[0] * taps[0] + across[1] * taps[1] + across[2] * taps[2] + across[3] * taps[3]
+        };
+        let sum = down[0] * line(0) + down[1] * line(1) + down[2] * line(2) + down[3] * line(3);
+        sum.clamp(0.0, 255.0)
+    }
+
+    #[cold]
+    fn cubic_at_edge(
+        &self,
+        (column, row): (usize, usize),
+        across: [f32; 4],
+        down: [f32; 4],
+    ) -> f32 {
+        let line = |k: usize| -> f32 {
+            let row = (row + k).saturating_sub(1).min(self.rows - 1);
+            let at = |j: usize| {
+                let column = (column + j).saturating_sub(1).min(self.columns - 1);
+                self.values[row * self.columns + column]
+            };
+            (0..4).map(|j| across[j] * at(j)).sum()
+        };
+        let sum: f32 = (0..4).map(|k| down[k] * line(k)).sum();
         sum.clamp(0.0, 255.0)
     }
 }

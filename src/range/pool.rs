@@ -12,8 +12,6 @@ pub(super) struct Sample {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Pooled {
     pub disparity_px: f64,
-    /// Standard deviation of the samples that agree.
-    pub spread_px: f64,
     pub support: u32,
     /// Share of all samples that agree.
     pub agreement: f64,
@@ -41,10 +39,8 @@ pub(super) fn pool(samples: &[Sample]) -> Option<Pooled> {
         middle = mean(near(middle).map(|sample| sample.disparity_px));
     }
     let support = near(middle).count();
-    let variance = mean(near(middle).map(|sample| (sample.disparity_px - middle).powi(2)));
     Some(Pooled {
         disparity_px: middle,
-        spread_px: variance.sqrt(),
         support: support as u32,
         agreement: support as f64 / samples.len() as f64,
         centroid: (

@@ -2,6 +2,7 @@
 
 use super::patch::{Area, Colour, Cutter, Gray};
 use super::reach::honest;
+use super::refine::Weights;
 use super::{Disparity, Method, Miss, RangeConfig, RangeError, RawPair, Refusal, Target};
 use crate::detect::DetectionClass;
 use opencv::core::Mat;
@@ -101,6 +102,11 @@ impl Mask {
     }
 }
 
+/// Surroundings of the target that matching may touch.
+const AROUND_PX: i32 = 10;
+/// Least weight of a pixel about the flame.
+const FAINTEST: f32 = 0.1;
+
 /// One target in one pair.
 pub(super) struct Scene<'a> {
     pub cutter: &'a Cutter,
@@ -114,6 +120,8 @@ pub(super) struct Scene<'a> {
     pub right_gray: &'a Mat,
     /// The flame, over the left eye's area.
     pub flame: Mask,
+    /// How far each of its pixels outshines the surroundings, 0 to 1: the less, the more shows through.
+    pub shine: Vec<f32>,
     pub search: Search,
     /// Of the rectified pair, pixels.
     pub focal_px: f64,
@@ -142,7 +150,7 @@ impl<'a> Scene<'a> {
         let left = cutter.left(&pair.left_bgr, around)?;
         let strip = around.grown(search.greatest.max(0), (-search.least).max(0), 0);
         let right = cutter.right_draft(right_gray, strip)?;
-        let flame = flame(&left, &area, config);
+        let (flame, shine) = flame(&left, &area, config);
         Ok(Self {
             cutter,
             left_bgr: &pair.left_bgr,
@@ -151,6 +159,7 @@ impl<'a> Scene<'a> {
             right,
             right_gray,
             flame,
+            shine,
             search,
             focal_px: cutter.focal_px(),
         })
@@ -161,67 +170,117 @@ impl<'a> Scene<'a> {
         honest(method, found, self.target.width(), self.focal_px)
     }
 
-    /// What the right eye shows `offset` columns from where the left one's context is, exactly.
+    /// How much the pixels about the flame count: as they outshine what is behind, and a little where
+    /// they do not.
+    pub fn weights(&self, reach: usize) -> Weights {
+        let kept = self.flame.grown(reach).kept;
+        let weight = |(kept, shine): (&bool, &f32)| if *kept { shine.max(FAINTEST) } else { 0.0 };
+        Weights {
+            area: self.flame.area,
+            values: kept.iter().zip(&self.shine).map(weight).collect(),
+        }
+    }
+
+    /// What the right eye shows `offset` columns from where the target is, exactly, and a little around.
     pub fn opposite(&self, offset: i32) -> Result<Gray, RangeError> {
-        let area = self.left.gray.area.grown(-offset, offset, 0);
+        let area = self.target.grown(AROUND_PX, AROUND_PX, AROUND_PX);
+        let area = area.grown(-offset, offset, 0);
         self.cutter.right(self.right_gray, area)
     }
 
     /// The left eye as far as what the right one shows `offset` columns on may come from there.
-    pub fn back(&self, offset: i32) -> Result<Gray, RangeError> {
-        let area = self.left.gray.area;
+    /// In rows `every` apart.
+    pub fn back(&self, offset: i32, every: i32) -> Result<Gray, RangeError> {
+        let area = self.target.grown(AROUND_PX, AROUND_PX, AROUND_PX);
         let area = area.grown(
             -offset - self.search.least,
             offset + self.search.greatest,
             0,
         );
-        self.cutter.left_draft(self.left_bgr, area)
+        self.cutter.left_draft(self.left_bgr, area, every)
     }
 }
 
-/// The flame's pixels in the box: those that the gate keeps and that outshine the surroundings.
-/// Where that leaves too few (dry grass is as yellow as flame), what the gate keeps; where that is
-/// too little as well (a thing in colours that the gate does not know), all of them.
-fn flame(left: &Colour, target: &Area, config: &RangeConfig) -> Mask {
+/// The flame's pixels in the box and how far they outshine the surroundings: those that the gate keeps
+/// and that outshine them at all. Where that leaves too few (dry grass is as yellow as flame), what the
+/// gate keeps; where that is too little as well (a thing in colours that the gate does not know), all
+/// of them, and all alike.
+fn flame(left: &Colour, target: &Area, config: &RangeConfig) -> (Mask, Vec<f32>) {
     let area = left.gray.area;
-    let inside: Vec<bool> = (area.top..area.bottom)
-        .flat_map(|row| (area.left..area.right).map(move |column| (column, row)))
-        .map(|(column, row)| target.holds(column, row))
-        .collect();
-    let floor = brightness_around(left, &inside);
-    let gate: Vec<bool> = inside
+    let shines: Vec<i16> = left.bgr.iter().map(|pixel| shine(*pixel)).collect();
+    let floor = brightness_around(&shines, &area, target);
+    let width = area.width();
+    let inside = (target.left - area.left).max(0) as usize..(target.right - area.left) as usize;
+    let rows = (target.top - area.top).max(0) as usize
+        ..((target.bottom - area.top) as usize).min(area.height());
+    let mut gate = vec![false; shines.len()];
+    for row in rows.clone() {
+        for index in row * width + inside.start..row * width + inside.end.min(width) {
+            gate[index] = config.mask.keeps(left.bgr[index]);
+        }
+    }
+    let shining: Vec<bool> = gate
         .iter()
-        .zip(&left.bgr)
-        .map(|(inside, pixel)| *inside && config.mask.keeps(*pixel))
-        .collect();
-    let shining = gate
-        .iter()
-        .zip(&left.bgr)
-        .map(|(kept, pixel)| *kept && shine(*pixel) > floor)
+        .zip(&shines)
+        .map(|(kept, shine)| *kept && *shine > floor)
         .collect();
     let enough =
-        |kept: &Vec<bool>| kept.iter().filter(|kept| **kept).count() >= config.min_support as usize;
-    let kept = [shining, gate].into_iter().find(enough).unwrap_or(inside);
-    Mask { area, kept }
+        |kept: &[bool]| kept.iter().filter(|kept| **kept).count() >= config.min_support as usize;
+    if enough(&shining) {
+        let excess = excess(&shines, &shining, floor);
+        return (
+            Mask {
+                area,
+                kept: shining,
+            },
+            excess,
+        );
+    }
+    let alike = vec![1.0; shines.len()];
+    if enough(&gate) {
+        return (Mask { area, kept: gate }, alike);
+    }
+    for row in rows {
+        gate[row * width + inside.start..row * width + inside.end.min(width)].fill(true);
+    }
+    (Mask { area, kept: gate }, alike)
+}
+
+/// Shine beyond the floor, 1 for what shines as brightly as most of the flame.
+fn excess(shines: &[i16], shining: &[bool], floor: i16) -> Vec<f32> {
+    let mut bright: Vec<i16> = shines
+        .iter()
+        .zip(shining)
+        .filter_map(|(shine, shining)| shining.then_some(*shine))
+        .collect();
+    let rank = bright.len() / 2;
+    let middle = *bright.select_nth_unstable(rank).1;
+    let share = 1.0 / f32::from(middle - floor).max(1.0);
+    let excess = |shine: &i16| (share * f32::from(shine - floor)).clamp(0.0, 1.0);
+    shines.iter().map(excess).collect()
 }
 
 /// How much like flame a pixel shines: bright in red, weak in blue.
-fn shine(bgr: [u8; 3]) -> i32 {
-    2 * i32::from(bgr[2]) - i32::from(bgr[0])
+fn shine(bgr: [u8; 3]) -> i16 {
+    2 * i16::from(bgr[2]) - i16::from(bgr[0])
 }
 
 /// Shine that hardly anything around the target exceeds.
-fn brightness_around(left: &Colour, inside: &[bool]) -> i32 {
-    let mut shines: Vec<i32> = left
-        .bgr
-        .iter()
-        .zip(inside)
-        .filter(|(_, inside)| !**inside)
-        .map(|(pixel, _)| shine(*pixel))
-        .collect();
-    if shines.is_empty() {
-        return i32::MIN;
+fn brightness_around(shines: &[i16], area: &Area, target: &Area) -> i16 {
+    let mut around = Vec::with_capacity(shines.len());
+    for (row, line) in (area.top..).zip(shines.chunks_exact(area.width().max(1))) {
+        if (target.top..target.bottom).contains(&row) {
+            let from = (target.left - area.left).clamp(0, line.len() as i32) as usize;
+            let to = (target.right - area.left).clamp(0, line.len() as i32) as usize;
+            around.extend_from_slice(&line[..from]);
+            around.extend_from_slice(&line[to..]);
+        } else {
+            around.extend_from_slice(line);
+        }
     }
-    let rank = shines.len() * 95 / 100;
-    *shines.select_nth_unstable(rank).1
+    if around.is_empty() {
+        return -256;
+    }
+    let rank = around.len() * 95 / 100;
+    *around.select_nth_unstable(rank).1
 }

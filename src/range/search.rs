@@ -21,54 +21,93 @@ pub(super) struct Peak {
 /// Pixels that are compared, about, at most: more of them change the whole pixel no longer.
 const MOST_PIXELS: usize = 900;
 
-/// Correlates the runs' pixels of `one` with those of `other` that lie `offset` columns further on.
+/// Which rows of a target are compared: all, every second one, and so on.
+pub(super) fn rows_apart(runs: &[Run]) -> i32 {
+    let pixels: usize = runs.iter().map(|run| (run.to - run.from) as usize).sum();
+    pixels.div_ceil(MOST_PIXELS).max(1) as i32
+}
+
+/// Correlates the runs' pixels of `one`, in rows `every` apart, with those of `other` that lie `offset`
+/// columns further on.
 pub(super) fn correlate(
     one: &Gray,
     other: &Gray,
     runs: &[Run],
+    every: i32,
     offsets: impl Iterator<Item = i32>,
 ) -> Curve {
-    let pixels: usize = runs.iter().map(|run| (run.to - run.from) as usize).sum();
-    let every = pixels.div_ceil(MOST_PIXELS).max(1) as i32;
     let runs: Vec<Run> = runs
         .iter()
-        .filter(|run| run.row % every == 0 || every == 1)
+        .filter(|run| run.row % every == 0)
         .copied()
         .collect();
+    let own = Own::of(one, &runs);
     let mut offsets = offsets.peekable();
     Curve {
         least: offsets.peek().copied().unwrap_or_default(),
         values: offsets
-            .map(|offset| at_offset(one, other, &runs, offset))
+            .map(|offset| {
+                if own.is_whole_at(other, offset) {
+                    own.sums
+                        .with_others(one, other, &runs, offset)
+                        .correlation(own.sums.n)
+                } else {
+                    at_edge(one, other, &runs, offset, own.sums.n)
+                }
+            })
             .collect(),
     }
 }
 
-fn at_offset(one: &Gray, other: &Gray, runs: &[Run], offset: i32) -> f64 {
-    let (mut wanted, mut sums) = (0, Sums::default());
+/// What is the same at every offset that cuts nothing off.
+struct Own {
+    sums: Sums,
+    columns: (i32, i32),
+}
+
+impl Own {
+    fn of(one: &Gray, runs: &[Run]) -> Self {
+        let mut sums = Sums::default();
+        let mut columns = (i32::MAX, i32::MIN);
+        for run in runs {
+            columns = (columns.0.min(run.from), columns.1.max(run.to));
+            let pixels = cut(one, run, 0);
+            sums.take(pixels, pixels);
+        }
+        Self { sums, columns }
+    }
+
+    fn is_whole_at(&self, other: &Gray, offset: i32) -> bool {
+        self.columns.0 + offset >= other.seen.0 && self.columns.1 + offset <= other.seen.1
+    }
+}
+
+/// A run's pixels, `offset` columns further on.
+fn cut<'a>(gray: &'a Gray, run: &Run, offset: i32) -> &'a [f32] {
+    let first = (run.from + offset - gray.area.left) as usize;
+    &gray.row(run.row)[first..first + (run.to - run.from) as usize]
+}
+
+fn at_edge(one: &Gray, other: &Gray, runs: &[Run], offset: i32, wanted: f64) -> f64 {
+    let mut sums = Sums::default();
     for run in runs {
-        wanted += run.to - run.from;
-        let from = run.from.max(other.seen.0 - offset);
-        let to = run.to.min(other.seen.1 - offset);
-        if from < to {
-            let cut = |gray: &Gray, shift: i32| {
-                let first = (from + shift - gray.area.left) as usize;
-                first..first + (to - from) as usize
-            };
-            sums.take(
-                &one.row(run.row)[cut(one, 0)],
-                &other.row(run.row)[cut(other, offset)],
-            );
+        let seen = Run {
+            row: run.row,
+            from: run.from.max(other.seen.0 - offset),
+            to: run.to.min(other.seen.1 - offset),
+        };
+        if seen.from < seen.to {
+            sums.take(cut(one, &seen, 0), cut(other, &seen, offset));
         }
     }
-    sums.correlation(f64::from(wanted))
+    sums.correlation(wanted)
 }
 
 /// Grey level that is taken off before squaring, so that single precision is enough.
 const MIDDLE: f32 = 128.0;
 const LANES: usize = 8;
 
-#[derive(Default)]
+#[derive(Debug, Clone, Copy, Default)]
 struct Sums {
     n: f64,
     x: f64,
@@ -100,6 +139,29 @@ impl Sums {
         self.xy += xy;
     }
 
+    /// The same own pixels with those that another eye shows.
+    fn with_others(mut self, one: &Gray, other: &Gray, runs: &[Run], offset: i32) -> Self {
+        (self.y, self.yy, self.xy) = (0.0, 0.0, 0.0);
+        for run in runs {
+            let (xs, ys) = (cut(one, run, 0), cut(other, run, offset));
+            let mut lanes = [[0.0_f32; LANES]; 3];
+            let (x_chunks, y_chunks) = (xs.chunks_exact(LANES), ys.chunks_exact(LANES));
+            for (x, y) in x_chunks.remainder().iter().zip(y_chunks.remainder()) {
+                add_other(&mut lanes, 0, *x, *y);
+            }
+            for (x, y) in x_chunks.zip(y_chunks) {
+                for k in 0..LANES {
+                    add_other(&mut lanes, k, x[k], y[k]);
+                }
+            }
+            let [y, yy, xy] = lanes.map(|lane| f64::from(lane.iter().sum::<f32>()));
+            self.y += y;
+            self.yy += yy;
+            self.xy += xy;
+        }
+        self
+    }
+
     fn correlation(&self, wanted: f64) -> f64 {
         let n = self.n;
         let (spread_x, spread_y) = (self.xx - self.x * self.x / n, self.yy - self.y * self.y / n);
@@ -119,6 +181,14 @@ fn add(lanes: &mut [[f32; LANES]; 5], k: usize, x: f32, y: f32) {
     lanes[2][k] += x * x;
     lanes[3][k] += y * y;
     lanes[4][k] += x * y;
+}
+
+#[inline]
+fn add_other(lanes: &mut [[f32; LANES]; 3], k: usize, x: f32, y: f32) {
+    let (x, y) = (x - MIDDLE, y - MIDDLE);
+    lanes[0][k] += y;
+    lanes[1][k] += y * y;
+    lanes[2][k] += x * y;
 }
 
 impl Curve {
@@ -175,7 +245,7 @@ mod tests {
 
     #[test]
     fn the_best_peak_is_where_the_same_stands_whatever_the_gain() {
-        let curve = correlate(&texture(0, 1.0), &texture(9, 0.4), &RUN, -20..=3);
+        let curve = correlate(&texture(0, 1.0), &texture(9, 0.4), &RUN, 1, -20..=3);
         let best = curve.peaks()[0];
         assert_eq!(best.at, -9);
         assert!(best.correlation > 0.999, "{best:?}");
@@ -184,9 +254,9 @@ mod tests {
     #[test]
     fn nothing_flat_and_nothing_outside_of_the_image_correlates() {
         let flat = gray(vec![90.0; 80]);
-        let curve = correlate(&texture(0, 1.0), &flat, &RUN, -20..=3);
+        let curve = correlate(&texture(0, 1.0), &flat, &RUN, 1, -20..=3);
         assert!(curve.values.iter().all(|value| value.is_nan()));
-        let curve = correlate(&texture(0, 1.0), &texture(0, 1.0), &RUN, -70..=-60);
+        let curve = correlate(&texture(0, 1.0), &texture(0, 1.0), &RUN, 1, -70..=-60);
         assert!(curve.peaks().is_empty());
     }
 }

@@ -3,7 +3,7 @@
 use super::patch::Gray;
 use super::pool::{Pooled, Sample, pool};
 use super::scene::{Mask, Scene, Search};
-use super::search::correlate;
+use super::search::{correlate, rows_apart};
 use super::{Disparity, Miss, RangeConfig, RangeError, Refusal};
 use emberfix_calib::RectifiedPixel;
 use opencv::calib3d::{StereoSGBM, StereoSGBM_MODE_SGBM};
@@ -28,6 +28,10 @@ impl SemiGlobal {
 
     pub fn find(&mut self, scene: &Scene<'_>) -> Result<Disparity, Miss> {
         let samples = self.samples(scene)?;
+        let covered = samples.len() as f64 / scene.flame.count().max(1) as f64;
+        if covered < LEAST_COVERED {
+            return Err(Refusal::Inconsistent.into());
+        }
         let pooled = pool(&samples).ok_or(Refusal::NoPeak)?;
         let config = &self.config;
         if pooled.support < config.min_support {
@@ -37,10 +41,7 @@ impl SemiGlobal {
             return Err(Refusal::Inconsistent.into());
         }
         borne_out(scene, &samples, &pooled, config)?;
-        // Pixels of one block share their evidence, so only one in a block's area counts.
-        let block = f64::from(config.block_px * config.block_px);
-        let witnesses = (f64::from(pooled.support) / block).max(1.0);
-        let sigma_px = (pooled.spread_px / witnesses.sqrt()).hypot(LOCKING_PX);
+        let sigma_px = UNSETTLED_PX * (1.0 - pooled.agreement);
         Ok(Disparity {
             px: pooled.disparity_px,
             sigma_px,
@@ -78,8 +79,13 @@ impl SemiGlobal {
     }
 }
 
-/// Semi-global matching pulls disparities towards whole pixels by about this, one sigma.
-const LOCKING_PX: f64 = 0.1;
+/// Pixels of error, one sigma, if no two pixels agreed. Neighbours share their errors, so that the spread
+/// of those that agree says little; how many do not agree says more.
+const UNSETTLED_PX: f64 = 1.7;
+/// Share of the flame that must have a valid disparity: where less has, the eyes show it differently.
+const LEAST_COVERED: f64 = 0.5;
+/// Least correlation of what was matched: no gain or offset is made up for pixel by pixel.
+const LEAST_LIKENESS: f64 = 0.8;
 
 /// A disparity that the target as a whole does not bear out is a phantom.
 fn borne_out(
@@ -102,9 +108,11 @@ fn borne_out(
     }
     let middle = -pooled.disparity_px.round() as i32;
     let offsets = (middle - 2).max(-scene.search.greatest)..=(middle + 2).min(-scene.search.least);
-    let curve = correlate(&scene.left.gray, &scene.right, &matched.runs(), offsets);
+    let runs = matched.runs();
+    let every = rows_apart(&runs);
+    let curve = correlate(&scene.left.gray, &scene.right, &runs, every, offsets);
     let best = curve.values.into_iter().fold(f64::NAN, f64::max);
-    if best >= config.min_correlation {
+    if best >= LEAST_LIKENESS.max(config.min_correlation) {
         Ok(())
     } else {
         Err(Refusal::NoPeak)

@@ -1,7 +1,7 @@
 //! `emberfix eval range`.
 
 use crate::cli::Failure;
-use crate::eval::range::{Options, SeedSet, measure, steps};
+use crate::eval::range::{Options, Part, SeedSet, measure, steps};
 
 /// Every way to range a flame, on rendered flames with truth.
 #[derive(Debug, clap::Args)]
@@ -18,6 +18,12 @@ pub struct RangeArguments {
     /// Flames to tune on, or flames kept aside.
     #[arg(long, value_enum, default_value = "report")]
     set: SeedSet,
+    /// Only a part: the figures of the others stay without a value.
+    #[arg(long, value_enum)]
+    only: Option<Part>,
+    /// Add every single answer to the JSON.
+    #[arg(long)]
+    rounds: bool,
     #[command(flatten)]
     common: super::Common,
 }
@@ -34,6 +40,8 @@ pub fn range(arguments: &RangeArguments) -> Result<(), Failure> {
         repeats: usize::from(repeats),
         quick: arguments.quick,
         set: arguments.set,
+        only: arguments.only,
+        rounds: arguments.rounds,
     };
     // Hidden where standard error is no terminal.
     let bar = indicatif::ProgressBar::new(steps(&options));

@@ -37,7 +37,7 @@ use emberfix_report::{Bound, Figure};
 use emberfix_sim::world::WorldError;
 use hardness::Suite;
 use middlebury::Scene;
-use outcome::{BEST, FULL_FRAME, NAMES, OURS};
+use outcome::{BEST, FULL_FRAME, NAMES, OURS, Round};
 use speed::Speed;
 use stats::{mean, rms};
 use subpixel::Step;
@@ -54,9 +54,32 @@ pub struct Options {
     pub quick: bool,
     /// Which set of flames.
     pub set: SeedSet,
+    /// Only this part; the figures of the others have no value then.
+    pub only: Option<Part>,
+    /// Every single answer goes into the details as well.
+    pub rounds: bool,
+}
+
+/// A part of the measurement.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum Part {
+    /// The papers' distances and ours.
+    Tables,
+    /// Hard flames.
+    Hard,
+    /// Fractions of a pixel.
+    Subpixel,
+    /// Middlebury's scenes.
+    Middlebury,
+    /// Time.
+    Speed,
 }
 
 impl Options {
+    fn wants(&self, part: Part) -> bool {
+        self.only.is_none_or(|only| only == part)
+    }
+
     /// Flames in each hard case.
     fn hard_repeats(&self) -> usize {
         if self.quick { 8 } else { 2 * self.repeats }
@@ -91,6 +114,7 @@ pub enum RangeEvalError {
 }
 
 /// Everything that was measured.
+#[derive(Default)]
 struct Findings {
     tables: Vec<Measured>,
     suites: Vec<Suite>,
@@ -115,19 +139,26 @@ pub fn steps(options: &Options) -> u64 {
 /// [`RangeEvalError`] when a rig, a world or OpenCV refuses; a method that ranges badly is no error.
 pub fn measure(options: &Options, tick: Tick) -> Result<Report, RangeEvalError> {
     let world = stage::world()?;
+    let mut findings = Findings::default();
     // Times first, while nothing else has warmed or worn the machine.
-    let speeds = speed::measure(&world, options, tick)?;
-    let tables: Result<Vec<_>, _> = tables::ALL
-        .iter()
-        .map(|series| tables::measure(series, &world, options, tick))
-        .collect();
-    let findings = Findings {
-        tables: tables?,
-        suites: hardness::measure(&world, options, tick)?,
-        steps: subpixel::measure(&world, options, tick)?,
-        scenes: middlebury::measure()?,
-        speeds,
-    };
+    if options.wants(Part::Speed) {
+        findings.speeds = speed::measure(&world, options, tick)?;
+    }
+    if options.wants(Part::Tables) {
+        for series in &tables::ALL {
+            let measured = tables::measure(series, &world, options, tick)?;
+            findings.tables.push(measured);
+        }
+    }
+    if options.wants(Part::Hard) {
+        findings.suites = hardness::measure(&world, options, tick)?;
+    }
+    if options.wants(Part::Subpixel) {
+        findings.steps = subpixel::measure(&world, options, tick)?;
+    }
+    if options.wants(Part::Middlebury) {
+        findings.scenes = middlebury::measure()?;
+    }
     Ok(findings.report(options))
 }
 
@@ -300,7 +331,9 @@ impl Findings {
         };
         let lines: Vec<Line> = self.tables.iter().flat_map(Measured::lines).collect();
         let counts: Vec<_> = self.suites.iter().flat_map(Suite::counts).collect();
+        let rounds = options.rounds.then(|| self.every_round());
         serde_json::json!({
+            "rounds": rounds,
             "set": options.set,
             "seed": options.seed,
             "repeats": options.repeats,
@@ -311,6 +344,31 @@ impl Findings {
             "middlebury": self.scenes,
             "speed": self.speeds,
         })
+    }
+
+    /// What every method said of every flame of the tables and of the hard cases.
+    fn every_round(&self) -> Vec<serde_json::Value> {
+        let told = |of: &str, distance_m: f64, round: &Round| {
+            let said = NAMES.iter().zip(&round.said);
+            let said: Vec<_> = said.map(|(name, said)| said.told(name)).collect();
+            serde_json::json!({ "of": of, "distance_m": distance_m, "said": said })
+        };
+        let tables = self.tables.iter().flat_map(|table| {
+            table.cells.iter().flat_map(move |cell| {
+                let rounds = cell.rounds.iter();
+                rounds.map(move |round| told(table.series.name, cell.distance_m, round))
+            })
+        });
+        let hard = self.suites.iter().flat_map(|suite| {
+            let rounds = suite.rounds.iter();
+            rounds.map(move |round| {
+                let stands_m = round
+                    .truth
+                    .depth_m(round.truth.disparity_px(round.truth.row()));
+                told(suite.case.name(), stands_m, round)
+            })
+        });
+        tables.chain(hard).collect()
     }
 
     fn drawn_steps(&self) -> Table {

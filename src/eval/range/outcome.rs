@@ -204,6 +204,19 @@ impl Said {
         }
     }
 
+    /// For the details.
+    pub(super) fn told(&self, method: &str) -> serde_json::Value {
+        let (px, sigma_px) = self.disparity.unzip();
+        serde_json::json!({
+            "method": method,
+            "disparity_px": px,
+            "sigma_px": sigma_px,
+            "truth_px": self.truth_px,
+            "measured": self.measured,
+            "verdict": self.verdict,
+        })
+    }
+
     /// Error in pixels of the disparity, weak or not.
     pub(super) fn off_px(&self) -> Option<f64> {
         self.disparity.map(|(px, _)| px - self.truth_px)

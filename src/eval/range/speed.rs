@@ -1,15 +1,19 @@
 //! Time per fire and per frame, against the whole frame matched, on one thread in one run.
+//!
+//! Time is the thread's own time on the processor: on a machine that has nothing else to do it is the
+//! time that passes, and on any other one it does not count what the others do.
 
 use super::outcome::config;
 use super::papers::FullFrame;
 use super::stage::{Recipe, RigName, SeedSet, Stage};
-use super::stats::median;
+use super::stats::{mean, median};
 use super::{Options, RangeEvalError, Tick};
 use crate::range::{Method, Ranger, RawPair, Target, open};
 use emberfix_sim::world::World;
+use rustix::time::{ClockId, clock_gettime};
 use std::hint::black_box;
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::Duration;
 
 /// Fires in the frame that has many.
 pub(super) const MANY: usize = 16;
@@ -53,6 +57,18 @@ pub(super) fn measure(
     speeds
 }
 
+/// Time that this thread has had on the processor.
+fn spent() -> Duration {
+    let now = clock_gettime(ClockId::ThreadCPUTime);
+    Duration::new(now.tv_sec.unsigned_abs(), now.tv_nsec.unsigned_abs() as u32)
+}
+
+fn timed_ms<T>(work: impl FnOnce() -> Result<T, RangeEvalError>) -> Result<f64, RangeEvalError> {
+    let before = spent();
+    black_box(work()?);
+    Ok((spent() - before).as_secs_f64() * 1e3)
+}
+
 fn one(
     method: Method,
     ranger: &mut dyn Ranger,
@@ -63,14 +79,11 @@ fn one(
 ) -> Result<Speed, RangeEvalError> {
     let (mut ones, mut manys, mut fulls) = (Vec::new(), Vec::new(), Vec::new());
     for _ in 0..pairs {
-        let started = Instant::now();
-        black_box(papers.match_frames(pair)?);
-        fulls.push(started.elapsed().as_secs_f64() * 1e3);
-        let started = Instant::now();
-        for target in targets {
-            black_box(ranger.range(pair, target)?);
-        }
-        manys.push(started.elapsed().as_secs_f64() * 1e3);
+        fulls.push(timed_ms(|| papers.match_frames(pair))?);
+        manys.push(timed_ms(|| {
+            let ranged = targets.iter().map(|target| ranger.range(pair, target));
+            Ok(ranged.collect::<Result<Vec<_>, _>>()?)
+        })?);
         // One fire: the mean of each by itself.
         ones.push(single(ranger, pair, targets)?);
     }
@@ -101,11 +114,9 @@ fn single(
     for target in targets {
         // A pair of its own, so that nothing is shared with the fire before.
         let fresh = pair.clone();
-        let started = Instant::now();
-        black_box(ranger.range(&fresh, target)?);
-        times.push(started.elapsed().as_secs_f64() * 1e3);
+        times.push(timed_ms(|| Ok(ranger.range(&fresh, target)?))?);
     }
-    Ok(median(&times).unwrap_or(f64::NAN))
+    Ok(mean(&times).unwrap_or(f64::NAN))
 }
 
 /// A frame put together from sixteen trials, each in its own part of the image.

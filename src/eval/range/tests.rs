@@ -12,6 +12,8 @@ const OPTIONS: Options = Options {
     repeats: 4,
     quick: true,
     set: SeedSet::Report,
+    only: None,
+    rounds: false,
 };
 
 fn stage(name: RigName) -> Stage {
