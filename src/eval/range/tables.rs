@@ -18,7 +18,7 @@ pub(super) struct Series {
     pub printed_percent: &'static [f64],
     width_m: (f64, f64),
     indoors: bool,
-    near_infrared: bool,
+    pub near_infrared: bool,
 }
 
 /// P1's six distances with its printed average error rates.
