@@ -63,6 +63,7 @@ pub fn page(input: &PageInput<'_>) -> Result<String, SolveError> {
     html += &cards(calibration)?;
     html += &range_table(calibration);
     html += &coverage_and_residuals(calibration);
+    html += &board(calibration);
     html += &per_view(calibration);
     if let Some((name, left, right)) = input.pair {
         html += &rectified_pair(calibration, name, left, right)?;
@@ -182,6 +183,27 @@ fn coverage_and_residuals(calibration: &Calibration) -> String {
         coverage_svg(&right, size),
         arrows_svg(&left, size),
         arrows_svg(&right, size)
+    )
+}
+
+/// What the pictures tell of the print and of the hands that held it.
+fn board(calibration: &Calibration) -> String {
+    let solution = &calibration.solution;
+    if !solution.model.uneven_board {
+        return String::new();
+    }
+    let heights = solution.uneven_m.iter().map(|off| 1e3 * off.z);
+    let (low, high) = heights.fold((f64::MAX, f64::MIN), |(low, high), height| {
+        (low.min(height), high.max(height))
+    });
+    let (turn_rad, move_m) = solution.step_sigma;
+    format!(
+        "<h2>What the pictures tell of the board</h2><p>Its corners lie {low:.2} to {high:.2} mm off its \
+         plane: paper is never flat, and that is solved for. Between the eyes' exposures it moved by \
+         ± {:.2} mm and turned by ± {:.2}° per axis as a rule: nothing, where both eyes are triggered at \
+         once.</p>",
+        1e3 * move_m,
+        turn_rad.to_degrees()
     )
 }
 

@@ -127,7 +127,11 @@ fn fly(path: &Path, seed: u64, flight: u32) -> Result<Flown, BoresightEvalError>
         path: path.display().to_string(),
     };
     let laid = sim.sim.world.boards.first().ok_or_else(no_board)?;
-    let board = Board::parse(&format!("{}x{}", laid.columns, laid.rows), laid.square_m)?;
+    let board = Board::parse(
+        &format!("{}x{}", laid.columns, laid.rows),
+        laid.square_m,
+        None,
+    )?;
     let marker = surveyed(&sim, laid).ok_or_else(no_board)?;
     let start = Start::of(&mission, Some(marker));
     let gathered = gather(

@@ -8,10 +8,10 @@
 use super::live::{LiveSource, Producer};
 use super::url::ServiceClock;
 use super::{
-    EncodedImage, ImageEncoding, SourceCounters, SourceError, StereoPair, StereoSource, note,
+    EncodedImage, Expected, ImageEncoding, SourceCounters, SourceError, StereoPair, StereoSource,
+    note,
 };
 use bytes::Bytes;
-use emberfix_calib::{Eye, Rig};
 use emberfix_frames::{ServiceTime, SignedDuration, Stamped, seconds};
 use opencv::core::{Mat, Rect};
 use opencv::prelude::{
@@ -104,10 +104,10 @@ const STAMP_AGE_LIMIT: SignedDuration = SignedDuration::from_secs(5);
 /// [`SourceError::NotOpened`], [`SourceError::Capture`], [`SourceError::FrameSize`].
 pub fn open(
     address: &CaptureAddress,
-    rig: &Rig,
+    expected: &Expected,
     clock: ServiceClock,
 ) -> Result<Box<dyn StereoSource>, SourceError> {
-    let mut grabber = Grabber::open(address, rig.camera(Eye::Left).image_size_px, clock)?;
+    let mut grabber = Grabber::open(address, expected.image_size_px(), clock)?;
     if matches!(address.device, CaptureDevice::File { .. }) {
         return Ok(Box::new(VideoFile {
             grabber,
@@ -171,7 +171,8 @@ impl StereoSource for VideoFile {
 /// The open devices of one camera.
 struct Grabber {
     address: CaptureAddress,
-    eye_size_px: (u32, u32),
+    /// Until the first device is open it may be any.
+    eye_size_px: Option<(u32, u32)>,
     clock: ServiceClock,
     captures: Vec<VideoCapture>,
     capture_clock: CaptureClock,
@@ -182,7 +183,7 @@ struct Grabber {
 impl Grabber {
     fn open(
         address: &CaptureAddress,
-        eye_size_px: (u32, u32),
+        eye_size_px: Option<(u32, u32)>,
         clock: ServiceClock,
     ) -> Result<Self, SourceError> {
         let mut grabber = Self {
@@ -217,7 +218,7 @@ impl Grabber {
         Ok(())
     }
 
-    fn open_one(&self, name: &str, backend: Backend) -> Result<VideoCapture, SourceError> {
+    fn open_one(&mut self, name: &str, backend: Backend) -> Result<VideoCapture, SourceError> {
         let mut capture =
             VideoCapture::from_file(name, backend.id()).map_err(|source| self.failed(source))?;
         if !capture.is_opened().unwrap_or(false) {
@@ -254,25 +255,26 @@ impl Grabber {
         }
     }
 
-    /// Columns and rows that a device's frames must have.
-    fn frame_size(&self) -> (i32, i32) {
-        let (width, height) = (self.eye_size_px.0 as i32, self.eye_size_px.1 as i32);
+    /// How many eyes stand side by side in a frame.
+    fn eyes_in_a_frame(&self) -> u32 {
         match self.address.device {
-            CaptureDevice::TwoV4l2 { .. } => (width, height),
-            _ => (2 * width, height),
+            CaptureDevice::TwoV4l2 { .. } => 1,
+            _ => 2,
         }
     }
 
-    fn check_size(&self, found_px: (i32, i32)) -> Result<(), SourceError> {
-        let expected_px = self.frame_size();
-        if found_px == expected_px {
+    /// Every frame must have the size that the first had, if none was asked for.
+    fn check_size(&mut self, found_px: (i32, i32)) -> Result<(), SourceError> {
+        let eyes = self.eyes_in_a_frame();
+        let found = (found_px.0.unsigned_abs(), found_px.1.unsigned_abs());
+        let (width, height) = *self.eye_size_px.get_or_insert((found.0 / eyes, found.1));
+        if found == (eyes * width, height) {
             return Ok(());
         }
-        let source_name = self.address.device.to_string();
         Err(SourceError::FrameSize {
-            source_name,
+            source_name: self.address.device.to_string(),
             found_px,
-            expected_px,
+            expected_px: ((eyes * width) as i32, height as i32),
         })
     }
 
@@ -309,7 +311,7 @@ impl Grabber {
         frames: &[(Mat, ServiceTime)],
         arrived: Option<ServiceTime>,
     ) -> opencv::Result<Option<Stamped<StereoPair>>> {
-        let width = self.eye_size_px.0 as i32;
+        let width = self.eye_size_px.unwrap_or_default().0 as i32;
         let (left, right) = match frames {
             [(left, left_at), (right, right_at)] => (
                 eye(left, 0, width, *left_at)?,
@@ -501,7 +503,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("pair.avi");
         write_video(&path, 2560, 720);
-        let mut source = open(&file_address(&path), &rig(), clock()).unwrap();
+        let mut source = open(&file_address(&path), &Expected::of(&rig()), clock()).unwrap();
         let mut pairs = Vec::new();
         while let Some(pair) = source.next_pair().unwrap() {
             pairs.push(pair);
@@ -538,7 +540,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("small.avi");
         write_video(&path, 640, 240);
-        let error = open(&file_address(&path), &rig(), clock())
+        let error = open(&file_address(&path), &Expected::of(&rig()), clock())
             .map(drop)
             .unwrap_err();
         assert!(matches!(
@@ -554,7 +556,9 @@ mod tests {
             device,
             format: CaptureFormat::default(),
         };
-        let error = open(&absent, &rig(), clock()).map(drop).unwrap_err();
+        let error = open(&absent, &Expected::of(&rig()), clock())
+            .map(drop)
+            .unwrap_err();
         assert!(
             matches!(
                 error,
@@ -577,7 +581,7 @@ mod tests {
         };
         let now: ServiceClock =
             Arc::new(|| at((monotonic_now().as_millis() % 1_000_000_000) as i64));
-        let Ok(mut source) = open(&address, &rig(), now) else {
+        let Ok(mut source) = open(&address, &Expected::of(&rig()), now) else {
             println!("skipped: no GStreamer with videotestsrc (gstreamer1.0-plugins-base)");
             return;
         };

@@ -122,6 +122,16 @@ impl ImageDecoder {
         self.decode(image, self.right_size_px, Pixels::Grey)
     }
 
+    /// For images of these sizes: others are refused.
+    #[must_use]
+    pub fn sized(left_size_px: (u32, u32), right_size_px: (u32, u32)) -> Self {
+        Self {
+            left_size_px,
+            right_size_px,
+            trailing_garbage: 0,
+        }
+    }
+
     /// JPEGs with bytes after their end; the image was used.
     #[must_use]
     pub fn trailing_garbage(&self) -> u64 {
@@ -170,6 +180,23 @@ impl ImageDecoder {
             }
         }
     }
+}
+
+/// Columns and rows that an image's own header states, within what any camera of ours has.
+///
+/// # Errors
+/// [`DecodeError`] where it is no image.
+pub fn stated_size_px(image: &EncodedImage) -> Result<(u32, u32), DecodeError> {
+    let size = match &image.encoding {
+        ImageEncoding::Jpeg => {
+            let header = JpegHeader::read(&image.bytes).map_err(|f| jpeg(f, &image.bytes))?;
+            (header.width, header.height)
+        }
+        ImageEncoding::Png => png_size(&image.bytes)?,
+        ImageEncoding::Raw { width, height, .. } => (*width, *height),
+    };
+    check_size(size, size)?;
+    Ok(size)
 }
 
 #[derive(Debug, Clone, Copy)]

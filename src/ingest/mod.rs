@@ -35,7 +35,7 @@ mod url;
 
 pub use blocks::RECORD_LIMIT_BYTES;
 pub use camera::CaptureClock;
-pub use decode::{DecodeError, EyeHealth, EyeWatch, ImageDecoder};
+pub use decode::{DecodeError, EyeHealth, EyeWatch, ImageDecoder, stated_size_px};
 pub use live::{LatestPair, PATIENCE, Taken};
 pub use mcap_stream::{McapStream, StreamEvent};
 pub use messages::{CalibrationMismatch, StatedCalibration};
@@ -45,6 +45,7 @@ pub use url::{CameraUrl, CameraUrlError, ServiceClock, open};
 
 use crate::assess::spectrum::Spectrum;
 use bytes::Bytes;
+use emberfix_calib::{Camera, Eye, Rig};
 use emberfix_frames::{ServiceTime, SignedDuration, Stamped};
 use std::path::PathBuf;
 
@@ -98,6 +99,32 @@ pub struct StereoPair {
 
 /// Spectrometer readings that wait for a pair at most; the oldest goes first.
 pub const SPECTRA: usize = 16;
+
+/// What images are expected.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Expected {
+    /// The cameras that they should come from; none are known while they are being calibrated.
+    pub cameras: Option<[Camera; 2]>,
+    /// Greatest difference of the two exposures that still counts as one moment, seconds.
+    pub max_skew_s: f64,
+}
+
+impl Expected {
+    /// A rig's.
+    #[must_use]
+    pub fn of(rig: &Rig) -> Self {
+        let camera = |eye| rig.camera(eye).clone();
+        Self {
+            cameras: Some([camera(Eye::Left), camera(Eye::Right)]),
+            max_skew_s: rig.max_skew_s(),
+        }
+    }
+
+    /// Columns, rows.
+    fn image_size_px(&self) -> Option<(u32, u32)> {
+        self.cameras.as_ref().map(|[left, _]| left.image_size_px)
+    }
+}
 
 /// A source of pairs.
 pub trait StereoSource: Send {

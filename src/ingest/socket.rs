@@ -6,8 +6,8 @@
 
 use super::live::{LiveSource, Producer};
 use super::url::ServiceClock;
-use super::{McapStream, SourceError, StereoSource, StreamEvent, note};
-use emberfix_calib::{Camera, Eye, Rig};
+use super::{Expected, McapStream, SourceError, StereoSource, StreamEvent, note};
+use emberfix_calib::{Camera, Eye};
 use std::io::{ErrorKind, Read};
 use std::net::{TcpListener, TcpStream};
 use std::os::unix::net::{UnixListener, UnixStream};
@@ -54,7 +54,7 @@ const READ_BYTES: usize = 64 * 1024;
 /// [`SourceError::Io`] when the address can't be bound.
 pub fn open(
     address: &SocketAddress,
-    rig: &Rig,
+    expected: &Expected,
     clock: ServiceClock,
 ) -> Result<Box<dyn StereoSource>, SourceError> {
     let doorway = Doorway::open(address).map_err(|source| SourceError::Io {
@@ -62,11 +62,8 @@ pub fn open(
         source,
     })?;
     let mut intake = Intake {
-        stream: McapStream::new(rig.max_skew_s()),
-        cameras: [
-            rig.camera(Eye::Left).clone(),
-            rig.camera(Eye::Right).clone(),
-        ],
+        stream: McapStream::new(expected.max_skew_s),
+        cameras: expected.cameras.clone(),
         mismatches: 0,
         clock,
     };
@@ -165,7 +162,8 @@ fn remove_stale(path: &Path) -> std::io::Result<()> {
 /// What is done with the bytes of one connection after the other.
 struct Intake {
     stream: McapStream,
-    cameras: [Camera; 2],
+    /// None yet while a rig is being calibrated.
+    cameras: Option<[Camera; 2]>,
     mismatches: u64,
     clock: ServiceClock,
 }
@@ -202,7 +200,10 @@ impl Intake {
                 StreamEvent::Pair(pair) => producer.slot.put(pair),
                 StreamEvent::Mavlink { .. } => {} // counted by the stream
                 StreamEvent::Calibration { eye, stated, .. } => {
-                    let camera = &self.cameras[usize::from(eye == Eye::Right)];
+                    let Some(cameras) = &self.cameras else {
+                        continue;
+                    };
+                    let camera = &cameras[usize::from(eye == Eye::Right)];
                     if let Err(mismatch) = stated.check(camera) {
                         note(
                             &mut self.mismatches,
@@ -277,7 +278,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("camera.sock");
         let address = SocketAddress::UnixListen(path.clone());
-        let mut source = open(&address, &rig(), clock()).unwrap();
+        let mut source = open(&address, &Expected::of(&rig()), clock()).unwrap();
         UnixStream::connect(&path)
             .unwrap()
             .write_all(&recording(0, 5))
@@ -314,7 +315,7 @@ mod tests {
         let port = probe.local_addr().unwrap();
         drop(probe);
         let address = SocketAddress::TcpConnect(port.to_string());
-        let mut source = open(&address, &rig(), clock()).unwrap();
+        let mut source = open(&address, &Expected::of(&rig()), clock()).unwrap();
         let listener = TcpListener::bind(port).unwrap();
         for round in 0..2 {
             let (mut connection, _) = listener.accept().unwrap();
@@ -328,10 +329,15 @@ mod tests {
     #[test]
     fn a_camera_that_sends_garbage_or_nothing_is_reported_and_survived() {
         let address = SocketAddress::TcpListen("127.0.0.1:0".to_owned());
-        assert!(open(&address, &rig(), clock()).is_ok());
+        assert!(open(&address, &Expected::of(&rig()), clock()).is_ok());
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("camera.sock");
-        let mut source = open(&SocketAddress::UnixListen(path.clone()), &rig(), clock()).unwrap();
+        let mut source = open(
+            &SocketAddress::UnixListen(path.clone()),
+            &Expected::of(&rig()),
+            clock(),
+        )
+        .unwrap();
         UnixStream::connect(&path)
             .unwrap()
             .write_all(&[0x5A; 100_000])
@@ -350,7 +356,9 @@ mod tests {
     fn an_address_that_is_taken_is_refused_at_once() {
         let taken = TcpListener::bind("127.0.0.1:0").unwrap();
         let address = SocketAddress::TcpListen(taken.local_addr().unwrap().to_string());
-        let error = open(&address, &rig(), clock()).map(drop).unwrap_err();
+        let error = open(&address, &Expected::of(&rig()), clock())
+            .map(drop)
+            .unwrap_err();
         assert!(
             error.is_fatal() && error.to_string().contains("tcp-listen:127.0.0.1"),
             "{error}"

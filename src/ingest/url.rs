@@ -3,8 +3,7 @@
 use super::camera::{self, CaptureAddress, CaptureDevice, CaptureFormat};
 use super::folder::{Folder, FolderAddress};
 use super::socket::{self, SocketAddress};
-use super::{Recording, SourceError, StereoSource};
-use emberfix_calib::Rig;
+use super::{Expected, Recording, SourceError, StereoSource};
 use emberfix_frames::ServiceTime;
 use std::path::PathBuf;
 use std::str::FromStr;
@@ -203,21 +202,22 @@ fn layout(options: &Options<'_>) -> Result<(), CameraUrlError> {
         .map(drop)
 }
 
-/// Opens what a URL names, for this rig.
+/// Opens what a URL names, for what is expected of it: a rig's images, or any.
 ///
 /// # Errors
 /// [`SourceError`] when it can't be opened, or does not fit the rig. A live peer that is not there
 /// yet is no error: it is awaited.
 pub fn open(
     url: &CameraUrl,
-    rig: &Rig,
+    expected: &Expected,
     clock: ServiceClock,
 ) -> Result<Box<dyn StereoSource>, SourceError> {
+    let skew_s = expected.max_skew_s;
     match url {
-        CameraUrl::Socket(address) => socket::open(address, rig, clock),
-        CameraUrl::Capture(address) => camera::open(address, rig, clock),
-        CameraUrl::Folder(address) => Ok(Box::new(Folder::open(address, rig.max_skew_s())?)),
-        CameraUrl::Recording(path) => Ok(Box::new(Recording::open(path, rig)?)),
+        CameraUrl::Socket(address) => socket::open(address, expected, clock),
+        CameraUrl::Capture(address) => camera::open(address, expected, clock),
+        CameraUrl::Folder(address) => Ok(Box::new(Folder::open(address, skew_s)?)),
+        CameraUrl::Recording(path) => Ok(Box::new(Recording::open_with_skew(path, skew_s)?)),
     }
 }
 

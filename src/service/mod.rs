@@ -23,7 +23,7 @@ pub(crate) use telemetry::WANTED;
 use crate::deliver::mavlink::MavlinkDelivery;
 use crate::deliver::{Outbox, OutboxError};
 use crate::ground::Ping;
-use crate::ingest::{CameraUrl, CameraUrlError, ServiceClock, SourceError};
+use crate::ingest::{CameraUrl, CameraUrlError, Expected, ServiceClock, SourceError};
 use crate::mission::Mission;
 use crate::pipeline::{Health, Pipeline};
 use crate::record::{RecordError, RecordOptions, Recorder};
@@ -185,7 +185,7 @@ pub async fn run(
     let mavlink_url: LinkUrl = mission.mavlink_url.parse()?;
     let camera_url: CameraUrl = mission.camera_url.parse()?;
     let link = Link::open(&mavlink_url).await?;
-    let source = crate::ingest::open(&camera_url, &mission.rig, Arc::clone(&clock))?;
+    let source = crate::ingest::open(&camera_url, &Expected::of(&mission.rig), Arc::clone(&clock))?;
     let http = courier::HttpCourier::new(&mission).map_err(ServiceError::GroundUrl)?;
     let recorder = record
         .map(|path| Recorder::create(path, &mission.rig, &RecordOptions::default()))

@@ -2,7 +2,7 @@
 //! may be used.
 
 use super::{
-    Board, Dropped, HeldOut, RangeError, SolveError, StereoSolution, View, cross_validate,
+    Board, Dropped, HeldOut, Model, RangeError, SolveError, StereoSolution, View, cross_validate,
     disparity_sigma_px, drop_worst, range_errors, solve,
 };
 use crate::{Eye, Finding, Rectification, Severity, implausible};
@@ -14,6 +14,8 @@ pub struct Demands {
     pub max_rms_px: f64,
     /// Leave out views that stand out.
     pub drop_worst: bool,
+    /// What is assumed of boards and lenses.
+    pub model: Model,
 }
 
 impl Default for Demands {
@@ -21,6 +23,7 @@ impl Default for Demands {
         Self {
             max_rms_px: 0.5,
             drop_worst: true,
+            model: Model::FULL,
         }
     }
 }
@@ -72,7 +75,7 @@ pub fn calibrate(
     image_size_px: (u32, u32),
     demands: Demands,
 ) -> Result<Calibration, SolveError> {
-    let solution = solve(board, &views, image_size_px)?;
+    let solution = solve(board, &views, image_size_px, demands.model)?;
     let (views, solution, dropped) = if demands.drop_worst {
         drop_worst(board, views, solution)?
     } else {
@@ -130,6 +133,7 @@ fn judge(calibration: &Calibration, demands: Demands) -> Result<Vec<Finding>, So
         few_pairs(calibration),
         foretells_badly(calibration),
         views_disagree(solution),
+        eyes_out_of_step(solution),
         many_dropped(calibration),
     ]
     .into_iter()
@@ -242,9 +246,27 @@ const WIDENED_LIMIT: f64 = 2.0;
 fn views_disagree(solution: &StereoSolution) -> Option<Finding> {
     (solution.widened_by > WIDENED_LIMIT).then(|| {
         Finding::doubt(format!(
-            "whole pairs disagree, so that every sigma was widened {:.1} times: do both eyes expose at \
-             the same moment, and is the board flat and held still?",
+            "whole pairs disagree, so that every sigma was widened {:.1} times: is the board stiff, and is \
+             it held still?",
             solution.widened_by
+        ))
+    })
+}
+
+/// A board that stands, before eyes in step, seems to move less than this between them, metres.
+const STILL_M: f64 = 5e-5;
+
+fn eyes_out_of_step(solution: &StereoSolution) -> Option<Finding> {
+    let typical_mm = 1e3 * solution.step_sigma.1;
+    let steps = solution.steps.iter().zip(&solution.residuals);
+    let (most_mm, name) = steps
+        .map(|(step, view)| (1e3 * step.move_m.norm(), &view.name))
+        .max_by(|a, b| a.0.total_cmp(&b.0))?;
+    (solution.step_sigma.1 > STILL_M).then(|| {
+        Finding::doubt(format!(
+            "the board moved between the eyes' exposures, by {typical_mm:.2} mm as a rule and by \
+             {most_mm:.1} mm in {name}: the eyes are out of step, or the board is not stiff; put the board \
+             down for each picture, and trigger both eyes at once before flying"
         ))
     })
 }

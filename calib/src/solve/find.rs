@@ -1,12 +1,13 @@
 //! Corners in one image, numbered the same way in every image.
 
-use super::{Board, Corner, View};
+use super::{Board, Corner, View, charuco};
 use crate::RawPixel;
 use emberfix_frames::Vector2;
 use opencv::core::{Mat, MatTraitConst, Point2f, Size, TermCriteria, Vector};
 use opencv::{Result, calib3d, imgcodecs, imgproc};
 
-/// All of the board's corners in a grey image (8 bit, one channel); `None` where it is not seen whole.
+/// The board's corners in a grey image (8 bit, one channel); `None` where it is not seen: a chessboard
+/// whole, a ChArUco board enough of it to count.
 ///
 /// A dim or flat image (a near-infrared eye's, say) gets a second look with its contrast raised.
 ///
@@ -26,6 +27,9 @@ pub fn find_corners(image: &Mat, board: &Board) -> Result<Option<Vec<Corner>>> {
 
 /// Finds in one version of the image, refines in the untouched one.
 fn look(contrasted: &Mat, image: &Mat, board: &Board) -> Result<Option<Vec<Corner>>> {
+    if let Some(markers) = board.markers {
+        return charuco::find(contrasted, image, board, markers);
+    }
     let mut points = Vector::<Point2f>::new();
     let flags = calib3d::CALIB_CB_ADAPTIVE_THRESH
         + calib3d::CALIB_CB_NORMALIZE_IMAGE

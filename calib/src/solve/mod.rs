@@ -1,33 +1,47 @@
 //! From pictures of a board to both cameras, the pair, and how well each number is known.
 //!
 //! **Purpose.** Zhang's method (Z. Zhang, "A flexible new technique for camera calibration", PAMI
-//! 2000) by OpenCV for each eye, then one least-squares problem over both eyes and every board pose,
-//! whose Jacobian at the solution gives the covariance. **In:** grey images, or corners in raw pixels;
-//! a [`Board`] in metres. **Out:** [`StereoSolution`]. No I/O, no clock, no randomness.
+//! 2000) by OpenCV for each eye, then one least-squares problem over both eyes, every board pose, the
+//! board's own unevenness and its steps between the eyes, whose Jacobian at the solution gives the
+//! covariance. **In:** grey images, or corners in raw pixels; a [`Board`] in metres; a [`Model`].
+//! **Out:** [`StereoSolution`]. No I/O, no clock, no randomness.
 //!
-//! **Assumptions.** A flat board; corner errors independent of each other, with one sigma an eye,
-//! which the residuals tell. Where whole views disagree by more than that (a bent board, eyes out of
-//! step), a jackknife over views widens [`StereoSolution::covariance`], each parameter by its own factor.
-//! **Known limits.** Every view needs the whole chessboard in both eyes; no ChArUco.
+//! **Assumptions.** Corner errors are independent of each other, with one sigma an eye, which the
+//! residuals tell. Boards are printed on paper that is not quite flat, the same in every view; hands move
+//! them between two eyes that are not quite in step, mostly little, now and then much. What of this there
+//! is the pictures tell; a flat board before eyes in step costs nothing. Where whole views disagree all the
+//! same, a jackknife over views widens [`StereoSolution::covariance`], each parameter by its own factor.
+//! **Known limits.** A board that bends from one view to the next; rolling shutters.
 
+mod aruco;
 mod board;
 mod calibration;
+mod charuco;
+mod dictionary;
+mod equations;
 mod find;
 mod joint;
+mod leftover;
 mod predict;
+mod prior;
 mod project;
 mod start;
+mod state;
 mod trust;
+mod wanted;
+mod weights;
 
-pub use board::{Board, BoardError};
+pub use board::{Board, BoardError, Markers};
 pub use calibration::{
     COVERAGE_CELLS, Calibration, Demands, TOLD_DEPTHS_M, calibrate, cell, epipolar_rms_px,
     rectification,
 };
+pub use dictionary::Dictionary;
 pub use find::{find_corners, make_consistent, read_grey};
-pub use joint::{BoardPose, GLOBALS, GlobalMatrix, GlobalVector, parameter_names};
 pub use predict::{RangeError, disparity_sigma_px, range_errors};
+pub use state::{BoardPose, GLOBALS, GlobalMatrix, GlobalVector, Step, parameter_names};
 pub use trust::{Dropped, HeldOut, cross_validate, drop_worst};
+pub use wanted::{Hold, Look, Wanted};
 
 use crate::{Camera, RawPixel};
 use emberfix_frames::{Matrix3, Vector3};
@@ -90,6 +104,39 @@ pub fn rms_px<'a>(residuals: impl Iterator<Item = &'a Residual>) -> f64 {
     (squares / count.max(1) as f64).sqrt()
 }
 
+/// What is assumed of boards and lenses.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Model {
+    /// The board's corners are found, not taken from the print: paper bends and is rough.
+    pub uneven_board: bool,
+    /// The board may move between the eyes' exposures.
+    pub moving_board: bool,
+    /// Pixels are square, lenses nearly centred, and third radial terms small.
+    pub lens_priors: bool,
+}
+
+impl Model {
+    /// All of it.
+    pub const FULL: Self = Self {
+        uneven_board: true,
+        moving_board: true,
+        lens_priors: true,
+    };
+    /// None of it: a perfect board, held perfectly still, and any lens, as OpenCV's `stereoCalibrate`
+    /// assumes.
+    pub const OPENCV: Self = Self {
+        uneven_board: false,
+        moving_board: false,
+        lens_priors: false,
+    };
+}
+
+impl Default for Model {
+    fn default() -> Self {
+        Self::FULL
+    }
+}
+
 /// Both cameras and how they stand to each other, with covariance.
 #[derive(Debug, Clone)]
 pub struct StereoSolution {
@@ -101,8 +148,16 @@ pub struct StereoSolution {
     pub right_from_left: Matrix3<f64>,
     /// Left camera's origin in right-camera components, metres (OpenCV's T).
     pub translation_m: Vector3<f64>,
+    /// What was assumed of boards and lenses.
+    pub model: Model,
+    /// How far each corner of the board lies from where it should have been printed, board axes, metres.
+    pub uneven_m: Vec<Vector3<f64>>,
     /// Where the board was, in the left camera, one a view.
     pub boards: Vec<BoardPose>,
+    /// How it moved between the eyes' exposures, one a view.
+    pub steps: Vec<Step>,
+    /// One sigma of a typical step per axis: turn in radians, move in metres.
+    pub step_sigma: (f64, f64),
     /// Covariance of the [`GLOBALS`] parameters in the order of [`parameter_names`]: pixels, pure
     /// numbers, radians about right-camera axes, metres.
     pub covariance: GlobalMatrix,
@@ -110,7 +165,7 @@ pub struct StereoSolution {
     pub corner_sigma_px: [f64; 2],
     /// The most by which a parameter's sigma was widened because whole views disagree; 1 when they don't.
     pub widened_by: f64,
-    /// What is left of every view.
+    /// What is left of every view with one pose of the board for both eyes.
     pub residuals: Vec<ViewResiduals>,
 }
 
@@ -139,7 +194,7 @@ impl StereoSolution {
     /// Every shared parameter, in the order of [`parameter_names`]; the rotation as a vector.
     #[must_use]
     pub fn values(&self) -> GlobalVector {
-        joint::values(self)
+        state::values(self)
     }
 
     /// One sigma of every parameter, in the order of [`parameter_names`].
@@ -187,6 +242,7 @@ pub fn solve(
     board: &Board,
     views: &[View],
     image_size_px: (u32, u32),
+    model: Model,
 ) -> Result<StereoSolution, SolveError> {
     if views.len() < FEWEST_VIEWS {
         return Err(SolveError::TooFewViews {
@@ -195,7 +251,7 @@ pub fn solve(
         });
     }
     let start = start::start(board, views, image_size_px)?;
-    joint::solve(board, views, start)
+    joint::solve(board, views, start, model)
 }
 
 /// Solves again from some of the views of a solution, beginning there.
@@ -211,6 +267,6 @@ pub fn solve_again(
     chosen: &[usize],
 ) -> Result<StereoSolution, SolveError> {
     let some: Vec<View> = chosen.iter().map(|&index| views[index].clone()).collect();
-    let boards = chosen.iter().map(|&index| from.boards[index]).collect();
-    joint::solve(board, &some, joint::State::from_solution(from, boards))
+    let start = state::State::from_solution(from, chosen);
+    joint::solve(board, &some, start, from.model)
 }

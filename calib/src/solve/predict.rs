@@ -1,9 +1,10 @@
 //! What the calibration's covariance means for ranges.
 
-use super::joint::{GLOBALS, GlobalVector, State};
+use super::state::{GLOBALS, GlobalVector, State};
 use super::{SolveError, StereoSolution};
 use crate::{Camera, Eye, RawPixel, Rectification};
 use emberfix_frames::Vector3;
+use nalgebra::DVector;
 
 /// One sigma of a range that comes from the calibration alone.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -68,7 +69,7 @@ fn inverse_depth_gradients(
     solution: &StereoSolution,
     depths_m: &[f64],
 ) -> Result<Vec<Vec<GlobalVector>>, SolveError> {
-    let here = State::from_solution(solution, Vec::new());
+    let here = State::from_solution(solution, &[]);
     let probes: Vec<Vec<(RawPixel, RawPixel)>> = depths_m
         .iter()
         .map(|&depth| probe_pixels(&here, depth))
@@ -77,9 +78,9 @@ fn inverse_depth_gradients(
     let sigmas = solution.sigmas();
     for index in 0..GLOBALS {
         let size = sigmas[index].max(1e-12) * 0.5;
-        let mut step = GlobalVector::zeros();
+        let mut step = DVector::zeros(GLOBALS);
         step[index] = size;
-        let (plus, minus) = (here.moved(&step), here.moved(&-step));
+        let (plus, minus) = (here.moved(step.as_view()), here.moved((-&step).as_view()));
         let (plus, minus) = (
             inverse_depths(&plus, &probes)?,
             inverse_depths(&minus, &probes)?,

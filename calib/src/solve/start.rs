@@ -1,7 +1,7 @@
 //! Where the joint problem begins: Zhang's method for each eye, and the pair from the view that
 //! agrees best with all others.
 
-use super::joint::{BoardPose, State};
+use super::state::{BoardPose, State, Step};
 use super::{Board, Corner, SolveError, View};
 use crate::Camera;
 use emberfix_frames::{Matrix3, UnitQuaternion, Vector3};
@@ -26,6 +26,8 @@ pub(super) fn start(
         right: right.camera,
         right_from_left,
         translation_m,
+        uneven_m: vec![Vector3::zeros(); board.corners()],
+        steps: vec![Step::default(); views.len()],
         boards: left.boards,
     })
 }

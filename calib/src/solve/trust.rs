@@ -1,7 +1,7 @@
 //! What the fit alone does not tell: views that spoil it, and how well it foretells views that it
 //! has not seen.
 
-use super::joint::held_out;
+use super::leftover::held_out;
 use super::{Board, SolveError, StereoSolution, View, ViewResiduals, rms_px, solve_again};
 
 /// A view that was left out, and why.

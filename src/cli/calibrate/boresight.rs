@@ -30,7 +30,7 @@ pub struct BoresightArguments {
     /// The marker's pixels, picked by hand: lines of PAIR,COLUMN,ROW.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["board", "boxes"])]
     picks: Option<PathBuf>,
-    /// The marker is the middle of a board: 7x5 (inner corners) or charuco:11x8:4x4_50.
+    /// The marker is the middle of a board: 7x5 (inner corners) or charuco:11x8 (squares).
     #[arg(long, value_name = "BOARD", conflicts_with = "boxes")]
     board: Option<String>,
     /// The marker is a fire: boxes from a file instead of the mission's model, which finds it otherwise.
@@ -119,9 +119,9 @@ fn picker(arguments: &BoresightArguments, mission: &Mission) -> Result<Picker, F
     Ok(
         match (&arguments.picks, &arguments.board, &arguments.boxes) {
             (Some(path), _, _) => Picker::Picks(Picks::load(path).map_err(Failure::refused)?),
-            // Squares of any size have the same middle.
+            // Squares of any size have the same middle; markers fill about three quarters of theirs.
             (_, Some(board), _) => {
-                Picker::Board(Board::parse(board, 0.1).map_err(Failure::refused)?)
+                Picker::Board(Board::parse(board, 0.1, Some(0.075)).map_err(Failure::refused)?)
             }
             (_, _, Some(path)) => fire(BoxFileDetector::load(path).map_err(Failure::refused)?),
             _ => Picker::Fire(detect::open(&mission.detector).map_err(Failure::refused)?),

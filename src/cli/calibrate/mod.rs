@@ -16,7 +16,7 @@ use std::path::Path;
 #[derive(Debug, clap::Subcommand)]
 pub enum Calibrate {
     /// Both eyes and the pair, from pictures of a board.
-    Stereo(stereo::StereoArguments),
+    Stereo(Box<stereo::StereoArguments>),
     /// A rig from a file of Kalibr, ROS, OpenCV or DepthAI.
     Import(import::ImportArguments),
     /// A rig as a file for ROS or OpenCV.

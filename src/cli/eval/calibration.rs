@@ -27,19 +27,28 @@ pub struct CalibrationArguments {
     /// Mission of those flights.
     #[arg(long, default_value = "missions/marker.toml")]
     flight_mission: PathBuf,
+    /// A tenth of the work: 4 rigs of 25 pairs, and one flight.
+    #[arg(long, conflicts_with_all = ["rigs", "pairs", "flights"])]
+    quick: bool,
     #[command(flatten)]
     common: super::Common,
+}
+
+impl CalibrationArguments {
+    fn of_work(&self, whole: usize, quick: usize) -> usize {
+        if self.quick { quick } else { whole }
+    }
 }
 
 /// Measures and shows.
 pub fn calibration(arguments: &CalibrationArguments) -> Result<(), Failure> {
     let options = Options {
         seed: arguments.seed,
-        rigs: arguments.rigs,
-        pairs: arguments.pairs,
+        rigs: arguments.of_work(arguments.rigs, 4),
+        pairs: arguments.of_work(arguments.pairs, 25),
         chess_a: chess_a(arguments),
     };
-    let bar = ProgressBar::new(arguments.rigs as u64).with_message("simulated rigs");
+    let bar = ProgressBar::new(options.rigs as u64).with_message("simulated rigs");
     if let Ok(style) = ProgressStyle::with_template("{msg} {wide_bar} {pos}/{len}") {
         bar.set_style(style);
     }
@@ -54,12 +63,17 @@ fn with_flights(arguments: &CalibrationArguments, report: Report) -> Result<Repo
     if arguments.flights == 0 {
         return Ok(report);
     }
-    let bar = ProgressBar::new(arguments.flights.into()).with_message("rendered flights");
+    let flights = if arguments.quick {
+        1
+    } else {
+        arguments.flights
+    };
+    let bar = ProgressBar::new(flights.into()).with_message("rendered flights");
     if let Ok(style) = ProgressStyle::with_template("{msg} {wide_bar} {pos}/{len}") {
         bar.set_style(style);
     }
     let options = boresight::Options {
-        flights: arguments.flights,
+        flights,
         seed: arguments.seed,
     };
     let flown = boresight::measure(&arguments.flight_mission, options, &mut |done| {

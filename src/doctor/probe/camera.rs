@@ -2,8 +2,8 @@
 
 use crate::doctor::judge::median;
 use crate::ingest::{
-    self, CameraUrl, CaptureClock, EncodedImage, EyeHealth, EyeWatch, ImageDecoder, SourceCounters,
-    StereoPair, StereoSource,
+    self, CameraUrl, CaptureClock, EncodedImage, Expected, EyeHealth, EyeWatch, ImageDecoder,
+    SourceCounters, StereoPair, StereoSource,
 };
 use crate::mission::Mission;
 use crate::range::{EyeComparer, RawPair};
@@ -131,7 +131,8 @@ fn open(mission: &Mission) -> Result<Box<dyn StereoSource>, String> {
         .camera_url
         .parse()
         .map_err(|error: ingest::CameraUrlError| error.to_string())?;
-    ingest::open(&url, &mission.rig, service_clock()).map_err(|error| error.to_string())
+    ingest::open(&url, &Expected::of(&mission.rig), service_clock())
+        .map_err(|error| error.to_string())
 }
 
 fn pair_seen(pair: &Stamped<StereoPair>) -> PairSeen {

@@ -35,6 +35,89 @@ pub const NEAR_INFRARED: Sight = Sight {
     noise: 4.0,
 };
 
+/// The paper: how it departs from a plane.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Paper {
+    /// Curvatures along rows, along the diagonal, and along columns, 1/m.
+    pub bend_per_m: [f64; 3],
+    /// Height of its waves, metres.
+    pub waves_m: f64,
+}
+
+impl Paper {
+    /// Length of a wave, metres.
+    const WAVE_M: f64 = 0.07;
+
+    /// Height over the plane, away from the camera, at a place seen from the board's middle.
+    fn height_m(self, x: f64, y: f64) -> f64 {
+        let [along, across, down] = self.bend_per_m;
+        let bent = 0.5 * (along * x * x + across * x * y + down * y * y);
+        let phase = std::f64::consts::TAU / Self::WAVE_M;
+        bent + self.waves_m * (phase * x).sin() * (phase * y + 1.0).cos()
+    }
+}
+
+/// A board at a pose: board to camera.
+#[derive(Debug, Clone, Copy)]
+pub struct Held<'a> {
+    pub board: &'a Board,
+    pub paper: Paper,
+    pub turn: Matrix3<f64>,
+    pub origin_m: Vector3<f64>,
+}
+
+/// Where rays meet the board.
+struct Meeting {
+    to_board: Matrix3<f64>,
+    /// The camera in board axes, metres.
+    camera_m: Vector3<f64>,
+    middle_m: Vector3<f64>,
+    paper: Paper,
+    square_m: f64,
+}
+
+impl Meeting {
+    fn of(held: &Held<'_>) -> Self {
+        let (turn, origin) = (&held.turn, held.origin_m);
+        let plane = Matrix3::from_columns(&[turn.column(0).into(), turn.column(1).into(), origin]);
+        Self {
+            // Board plane (x, y, 1) to camera; its inverse takes rays to the board.
+            to_board: plane.try_inverse().unwrap_or_else(Matrix3::identity),
+            camera_m: -(turn.transpose() * origin),
+            middle_m: held.board.middle_m(),
+            paper: held.paper,
+            square_m: held.board.square_m,
+        }
+    }
+
+    /// On the plane, in squares from the first inner corner.
+    fn on_plane(&self, (x, y): (f64, f64)) -> (f64, f64) {
+        let m = self.to_board.as_slice();
+        let scale = ((m[2] * x + m[5] * y + m[8]) * self.square_m).recip();
+        (
+            (m[0] * x + m[3] * y + m[6]) * scale,
+            (m[1] * x + m[4] * y + m[7]) * scale,
+        )
+    }
+
+    /// On the paper, in squares from the first inner corner: along the ray from the plane to its height,
+    /// which changes little on the way.
+    fn on_paper(&self, ray: (f64, f64)) -> (f64, f64) {
+        let flat = self.on_plane(ray);
+        let (mut a, mut b) = flat;
+        for _ in 0..2 {
+            let (x, y) = (a * self.square_m, b * self.square_m);
+            let height = self
+                .paper
+                .height_m(x - self.middle_m.x, y - self.middle_m.y);
+            let share = height / self.camera_m.z;
+            a = flat.0 + (self.camera_m.x / self.square_m - flat.0) * share;
+            b = flat.1 + (self.camera_m.y / self.square_m - flat.1) * share;
+        }
+        (a, b)
+    }
+}
+
 /// The rays of all pixels of a camera: x and y at depth 1.
 pub struct Rays {
     size: (usize, usize),
@@ -107,32 +190,27 @@ const SAMPLES: usize = 4;
 /// White paper around the pattern, squares.
 const MARGIN: f64 = 1.0;
 
-/// The board at a pose (board to camera), as the eye sees it; grey, 8 bit.
+/// The board as the eye sees it; grey, 8 bit.
 ///
 /// # Errors
 /// What OpenCV says.
 pub fn render(
     rays: &Rays,
-    board: &Board,
-    turn: &Matrix3<f64>,
-    origin_m: &Vector3<f64>,
+    held: &Held<'_>,
     sight: Sight,
     random: &mut impl Rng,
 ) -> opencv::Result<Mat> {
     let (width, height) = rays.size;
-    // Board plane (x, y, 1) to camera; its inverse takes rays to the board.
-    let plane = Matrix3::from_columns(&[turn.column(0).into(), turn.column(1).into(), *origin_m]);
-    let to_board = plane.try_inverse().unwrap_or_else(Matrix3::identity);
-    let scale = board.square_m;
+    let meeting = Meeting::of(held);
     let background = 0.5 * (sight.grey.0 + sight.grey.1);
     let tilt = random.random_range(-0.15..0.15);
     let mut pixels = vec![0.0_f32; width * height];
     for (index, pixel) in pixels.iter_mut().enumerate() {
         let (column, row) = (index % width, index / width);
         let light = 1.0 + tilt * (column as f64 / width as f64 - 0.5);
-        let grey = if near_board(&to_board, scale, board, rays.at(column, row)) {
+        let grey = if near_board(&meeting, held.board, rays.at(column, row)) {
             let slopes = rays.with_slopes(column, row);
-            sampled(&to_board, scale, board, slopes, sight, background)
+            sampled(&meeting, held.board, slopes, sight, background)
         } else {
             background
         };
@@ -141,26 +219,15 @@ pub fn render(
     finish(&pixels, height as i32, sight, random)
 }
 
-/// In squares from the first inner corner.
-fn on_board(to_board: &Matrix3<f64>, scale: f64, (x, y): (f64, f64)) -> (f64, f64) {
-    let m = to_board.as_slice();
-    let scale = ((m[2] * x + m[5] * y + m[8]) * scale).recip();
-    (
-        (m[0] * x + m[3] * y + m[6]) * scale,
-        (m[1] * x + m[4] * y + m[7]) * scale,
-    )
-}
-
-fn near_board(to_board: &Matrix3<f64>, scale: f64, board: &Board, ray: (f64, f64)) -> bool {
-    let (a, b) = on_board(to_board, scale, ray);
+fn near_board(meeting: &Meeting, board: &Board, ray: (f64, f64)) -> bool {
+    let (a, b) = meeting.on_plane(ray);
     let reach = 1.0 + MARGIN + 1.0;
     (-reach..board.columns as f64 + reach).contains(&a)
         && (-reach..board.rows as f64 + reach).contains(&b)
 }
 
 fn sampled(
-    to_board: &Matrix3<f64>,
-    scale: f64,
+    meeting: &Meeting,
     board: &Board,
     [ray, by_column, by_row]: [(f64, f64); 3],
     sight: Sight,
@@ -175,7 +242,7 @@ fn sampled(
                 ray.0 + across * by_column.0 + down * by_row.0,
                 ray.1 + across * by_column.1 + down * by_row.1,
             );
-            sum += grey_at(on_board(to_board, scale, sample), board, sight, background);
+            sum += grey_at(meeting.on_paper(sample), board, sight, background);
         }
     }
     sum / (SAMPLES * SAMPLES) as f64

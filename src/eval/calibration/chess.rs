@@ -3,8 +3,8 @@
 use super::CalibrationEvalError;
 use crate::eval::Table;
 use emberfix_calib::solve::{
-    Board, HeldOut, StereoSolution, View, cross_validate, find_corners, make_consistent, read_grey,
-    solve, solve_again,
+    Board, HeldOut, Model, StereoSolution, View, cross_validate, find_corners, make_consistent,
+    read_grey, solve, solve_again,
 };
 use emberfix_report::{Bound, Figure};
 use rand::SeedableRng;
@@ -24,28 +24,36 @@ pub(super) struct ChessA {
     solution: StereoSolution,
     held_out: HeldOut,
     pairs: usize,
+    halves: Halves,
+    /// With a flat board that is held still, as OpenCV assumes.
+    like_opencv: Halves,
+}
+
+/// Baselines of random halves of the pairs, millimetres.
+struct Halves {
+    /// Their standard deviation: the figure.
     spread_mm: f64,
+    /// The farthest from that of all pairs.
     widest_mm: f64,
+    /// What their own covariances foretell, root mean square.
+    foretold_mm: f64,
 }
 
 pub(super) fn measure(folder: &Path, seed: u64) -> Result<ChessA, CalibrationEvalError> {
-    let board = Board::parse("9x6", SQUARE_M).map_err(|_| CalibrationEvalError::NoImage {
-        path: folder.to_owned(),
-    })?;
+    let board = Board::chess(9, 6, SQUARE_M);
     let views = views(folder, &board)?;
-    let solution = solve(&board, &views, SIZE_PX)?;
-    let baselines_mm = halves(&board, &views, &solution, seed)?;
-    let mean = baselines_mm.iter().sum::<f64>() / baselines_mm.len() as f64;
-    let squares: f64 = baselines_mm.iter().map(|mm| (mm - mean).powi(2)).sum();
-    let full_mm = 1e3 * solution.baseline_m();
+    let of_model = |model| {
+        let solution = solve(&board, &views, SIZE_PX, model)?;
+        let halves = halves(&board, &views, &solution, seed)?;
+        Ok::<_, CalibrationEvalError>((solution, halves))
+    };
+    let (solution, halves) = of_model(Model::FULL)?;
+    let (_, like_opencv) = of_model(Model::OPENCV)?;
     Ok(ChessA {
         held_out: cross_validate(&board, &views, &solution)?,
         pairs: views.len(),
-        spread_mm: (squares / (baselines_mm.len() - 1) as f64).sqrt(),
-        widest_mm: baselines_mm
-            .iter()
-            .map(|mm| (mm - full_mm).abs())
-            .fold(0.0, f64::max),
+        halves,
+        like_opencv,
         solution,
     })
 }
@@ -68,13 +76,12 @@ fn views(folder: &Path, board: &Board) -> Result<Vec<View>, CalibrationEvalError
     Ok(found.into_iter().flatten().collect())
 }
 
-/// Baselines of random halves, millimetres.
 fn halves(
     board: &Board,
     views: &[View],
     solution: &StereoSolution,
     seed: u64,
-) -> Result<Vec<f64>, CalibrationEvalError> {
+) -> Result<Halves, CalibrationEvalError> {
     let splits: Vec<Vec<usize>> = (0..SPLITS)
         .map(|split| {
             let mut random = ChaCha8Rng::seed_from_u64(seed);
@@ -84,12 +91,27 @@ fn halves(
             order
         })
         .collect();
-    let baselines = splits.par_iter().flat_map(|order| {
+    let found = splits.par_iter().flat_map(|order| {
         let (one, other) = order.split_at(order.len() / 2);
-        [one, other]
-            .map(|half| solve_again(board, views, solution, half).map(|s| 1e3 * s.baseline_m()))
+        [one, other].map(|half| {
+            let half = solve_again(board, views, solution, half)?;
+            Ok::<_, CalibrationEvalError>((1e3 * half.baseline_m(), 1e3 * half.baseline_sigma_m()))
+        })
     });
-    Ok(baselines.collect::<Result<_, _>>()?)
+    let found: Vec<(f64, f64)> = found.collect::<Result<_, _>>()?;
+    let count = found.len() as f64;
+    let mean = found.iter().map(|(mm, _)| mm).sum::<f64>() / count;
+    let squares: f64 = found.iter().map(|(mm, _)| (mm - mean).powi(2)).sum();
+    let foretold: f64 = found.iter().map(|(_, sigma)| sigma.powi(2)).sum();
+    let full_mm = 1e3 * solution.baseline_m();
+    Ok(Halves {
+        spread_mm: (squares / (count - 1.0)).sqrt(),
+        widest_mm: found
+            .iter()
+            .map(|(mm, _)| (mm - full_mm).abs())
+            .fold(0.0, f64::max),
+        foretold_mm: (foretold / count).sqrt(),
+    })
 }
 
 impl ChessA {
@@ -104,9 +126,21 @@ impl ChessA {
             ),
             Figure::bounded(
                 "calibration.baseline_spread_mm",
-                Some(self.spread_mm),
+                Some(self.halves.spread_mm),
                 "mm",
                 Bound::AtMost(0.2),
+                2 * SPLITS,
+            ),
+            Figure::told(
+                "calibration.baseline_spread_foretold_mm",
+                Some(self.halves.foretold_mm),
+                "mm",
+                2 * SPLITS,
+            ),
+            Figure::told(
+                "calibration.baseline_spread_like_opencv_mm",
+                Some(self.like_opencv.spread_mm),
+                "mm",
                 2 * SPLITS,
             ),
             Figure::told(
@@ -137,16 +171,28 @@ impl ChessA {
                     ),
                 ),
                 row(
-                    "baseline of random halves, spread, mm",
-                    format!("{:.3}", self.spread_mm),
+                    "baseline of random halves, standard deviation, mm",
+                    format!("{:.3}", self.halves.spread_mm),
                 ),
                 row(
-                    "the same over root two, to hold against the sigma, mm",
-                    format!("{:.3}", self.spread_mm / std::f64::consts::SQRT_2),
+                    "the same as the halves' own covariances foretell it, mm",
+                    format!("{:.3}", self.halves.foretold_mm),
+                ),
+                row(
+                    "the same with a flat, still board (as OpenCV has it), mm",
+                    format!("{:.3}", self.like_opencv.spread_mm),
                 ),
                 row(
                     "the half that is farthest off, mm",
-                    format!("{:.3}", self.widest_mm),
+                    format!("{:.3}", self.halves.widest_mm),
+                ),
+                row(
+                    "board from eye to eye, mm and degrees per axis",
+                    format!(
+                        "± {:.2}, ± {:.2}",
+                        1e3 * self.solution.step_sigma.1,
+                        self.solution.step_sigma.0.to_degrees()
+                    ),
                 ),
                 row(
                     "focal length, left, px",
@@ -167,8 +213,10 @@ impl ChessA {
             "held_out_rms_px": self.held_out.rms_px,
             "baseline_m": self.solution.baseline_m(),
             "baseline_sigma_m": self.solution.baseline_sigma_m(),
-            "spread_mm": self.spread_mm,
-            "widest_mm": self.widest_mm,
+            "spread_mm": self.halves.spread_mm,
+            "widest_mm": self.halves.widest_mm,
+            "spread_foretold_mm": self.halves.foretold_mm,
+            "spread_like_opencv_mm": self.like_opencv.spread_mm,
         })
     }
 }

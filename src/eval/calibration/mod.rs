@@ -2,8 +2,9 @@
 //!
 //! **In:** a seed, how many rigs; the folder of `chess_a`, if it is there. **Out:** a [`Report`] with the
 //! figures `calibration.*`. **Assumptions.** Simulated boards are *rendered* through each eye's own lens
-//! and found by the same finder as real ones: blur, noise, near-infrared contrast and all.
-//! **Known limits.** The simulated board is flat, still, and seen by both eyes at one moment.
+//! and found by the same finder as real ones: blur, noise, near-infrared contrast and all. The paper is bent
+//! and wavy, and hands move it between eyes that are not quite in step, in a quarter of the pairs by much.
+//! **Known limits.** Global shutters; a lens of the model that is solved for.
 
 mod boards;
 mod chess;

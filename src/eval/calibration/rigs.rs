@@ -1,7 +1,7 @@
 //! One simulated rig: made up, photographed, calibrated, compared.
 
 use super::CalibrationEvalError;
-use super::boards::{NEAR_INFRARED, Rays, Sight, VISIBLE, render};
+use super::boards::{Held, NEAR_INFRARED, Paper, Rays, Sight, VISIBLE, render};
 use emberfix_calib::solve::{
     Board, Calibration, Demands, View, calibrate as solve, find_corners, make_consistent,
 };
@@ -12,11 +12,7 @@ use rand_chacha::ChaCha8Rng;
 use std::path::Path;
 
 /// P2's and P4's board.
-const BOARD: Board = Board {
-    columns: 9,
-    rows: 6,
-    square_m: 0.028,
-};
+const BOARD: Board = Board::chess(9, 6, 0.028);
 
 /// What came of one rig.
 #[derive(Debug)]
@@ -151,13 +147,29 @@ fn photograph(
     let left_rays = Rays::of(rig.camera(Eye::Left));
     let right_rays = Rays::of(rig.camera(Eye::Right));
     let left_sight: Sight = if infrared { NEAR_INFRARED } else { VISIBLE };
+    let paper = paper(random);
     let mut views = Vec::new();
     for number in 0..pairs {
         let (turn, origin_m) = pose(rig, number, random);
-        let left = render(&left_rays, &BOARD, &turn, &origin_m, left_sight, random)?;
-        let in_right = rig.right_from_left() * origin_m + rig.right_from_left_translation_m();
-        let turned = rig.right_from_left() * turn;
-        let right = render(&right_rays, &BOARD, &turned, &in_right, VISIBLE, random)?;
+        let held = Held {
+            board: &BOARD,
+            paper,
+            turn,
+            origin_m,
+        };
+        let (stepped, blur_px) = step(&held, random);
+        let in_right = Held {
+            turn: rig.right_from_left() * stepped.turn,
+            origin_m: rig.right_from_left() * stepped.origin_m
+                + rig.right_from_left_translation_m(),
+            ..stepped
+        };
+        let blurred = |sight: Sight| Sight {
+            blur_px: sight.blur_px.hypot(blur_px),
+            ..sight
+        };
+        let left = render(&left_rays, &held, blurred(left_sight), random)?;
+        let right = render(&right_rays, &in_right, blurred(VISIBLE), random)?;
         let found = (find_corners(&left, &BOARD)?, find_corners(&right, &BOARD)?);
         if let (Some(left), Some(right)) = found {
             let name = number.to_string();
@@ -165,6 +177,37 @@ fn photograph(
         }
     }
     Ok(views)
+}
+
+/// A print on paper that was glued to a plate: sags of up to a millimetre, waves of a tenth.
+fn paper(random: &mut impl Rng) -> Paper {
+    Paper {
+        bend_per_m: std::array::from_fn(|_| random.random_range(-0.15..0.15)),
+        waves_m: random.random_range(0.0..1.5e-4),
+    }
+}
+
+/// Share of the pairs in which the hand did not hold still.
+const UNSTEADY: f64 = 0.25;
+
+/// The board as the other eye finds it, and the blur of its motion: eyes are not quite in step, and hands
+/// mostly hold still.
+fn step<'a>(held: &Held<'a>, random: &mut impl Rng) -> (Held<'a>, f64) {
+    let unsteady = random.random_bool(UNSTEADY);
+    let (turn_rad, move_m, blur_px) = if unsteady {
+        (4e-3, 6e-4, random.random_range(0.3..1.0))
+    } else {
+        (5e-4, 1e-4, 0.0)
+    };
+    let mut vector = |size: f64| Vector3::from_fn(|_, _| random.random_range(-size..size));
+    let turn = UnitQuaternion::from_scaled_axis(vector(turn_rad)).to_rotation_matrix();
+    let middle = held.turn * BOARD.middle_m();
+    let stepped = Held {
+        turn: turn.into_inner() * held.turn,
+        origin_m: held.origin_m + middle - turn * middle + vector(move_m),
+        ..*held
+    };
+    (stepped, blur_px)
 }
 
 /// Places in the image that are visited in turn: corners and edges as often as the middle.
