@@ -139,6 +139,48 @@ fn cap_alerts_updates_and_cancels_in_one_chain() {
 }
 
 #[test]
+fn cap_takes_back_what_went_into_another_incident() {
+    let Some(clients) = Clients::find() else {
+        return;
+    };
+    let station = Station::start(CAP);
+    station.tell(&fire());
+    let mut other = fire();
+    other["properties"]["id"] = "uav-1-8".into();
+    // 90 m further east: nobody takes it for the same fire.
+    other["geometry"]["coordinates"][0] = 119.113.into();
+    station.tell(&other);
+    let feed = format!("{}/cap.atom", station.url);
+    let of = |n: usize| {
+        let many = |cap: &Value| cap["messages"].as_array().unwrap().len() >= n;
+        eventually(|| read(&clients, "cap", &feed), many)["messages"].clone()
+    };
+    let alerts = of(2);
+    assert_eq!(
+        (&alerts[0]["msgType"], &alerts[1]["msgType"]),
+        (&json!("Alert"), &json!("Alert"))
+    );
+    station.order(
+        "uav-1-7",
+        &json!({ "kind": "merge", "by": "Ana", "with": "uav-1-8" }),
+    );
+    let cancel = of(3)[2].clone();
+    assert_eq!(cancel["msgType"], "Cancel", "{cancel:#}");
+    assert_eq!(cancel["incidents"], "uav-1-8 uav-1-7");
+    assert_eq!(
+        cancel["note"],
+        "The same fire as uav-1-7, under which it goes on."
+    );
+    assert!(
+        cancel["references"]
+            .as_str()
+            .unwrap()
+            .contains(",uav-1-8.1,"),
+        "{cancel:#}"
+    );
+}
+
+#[test]
 fn foxglove_shows_the_fire_live() {
     let Some(clients) = Clients::find() else {
         return;

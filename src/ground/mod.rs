@@ -280,6 +280,8 @@ pub(crate) struct Station {
     published: Arc<Published>,
     chips: Arc<Mutex<Chips>>,
     screens: Screens,
+    /// Incidents as the event streams tell them.
+    texts: events::Texts,
     tracks: Mutex<Tracks>,
     /// What is told once. Bound: [`NOTICES_QUEUED`]; loss: oldest first, per stream.
     notices: broadcast::Sender<Notice>,
@@ -309,6 +311,7 @@ impl Station {
             published,
             chips,
             screens: Screens::open(&config.screens, &config.data_dir)?,
+            texts: events::Texts::default(),
             tracks: Mutex::default(),
             notices: broadcast::Sender::new(NOTICES_QUEUED),
             stopping: watch::Sender::new(false),

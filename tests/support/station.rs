@@ -49,9 +49,13 @@ impl Station {
 
     /// An operator does something.
     pub fn act(&self, incident: &str, kind: &str) {
-        let order = serde_json::json!({ "kind": kind, "by": "Ana" });
+        self.order(incident, &serde_json::json!({ "kind": kind, "by": "Ana" }));
+    }
+
+    /// The same, in full.
+    pub fn order(&self, incident: &str, order: &Value) {
         let url = format!("{}/incidents/{incident}/actions", self.url);
-        ureq::post(&url).send_json(&order).unwrap();
+        ureq::post(&url).send_json(order).unwrap();
     }
 
     /// A JSON answer.

@@ -176,21 +176,58 @@ pub(super) fn due(incident: &Incident, issued: Option<&Issued>, now: ServiceTime
     is_news.then_some(Kind::Update)
 }
 
-/// One message. `identifier` is its name, given once.
+/// Name and time of a message, and the names of those before it.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Heading<'a> {
+    /// Given once, never again.
+    pub identifier: &'a str,
+    pub earlier: &'a [String],
+    pub sent: ServiceTime,
+}
+
+/// A message of how an incident stands.
 pub(super) fn message(
     kind: Kind,
     incident: &Incident,
-    identifier: &str,
-    earlier: &[String],
+    heading: Heading<'_>,
     config: &CapConfig,
-    now: ServiceTime,
 ) -> String {
+    let by = incident.operator.by.as_deref().unwrap_or("an operator");
+    let note = (kind == Kind::Cancel).then(|| format!("Dismissed by {by}: no fire."));
+    envelope(kind, status(incident, config), heading, config)
+        .children(note.map(|note| Element::leaf("note", note)))
+        .children(references(heading.earlier))
+        .field("incidents", token(&incident.id))
+        .child(info(kind, incident, config, heading.sent))
+        .document()
+}
+
+/// The `Cancel` of an incident that went into another; what there is to know stands there.
+pub(super) fn merged(
+    id: &str,
+    heir: &Incident,
+    heading: Heading<'_>,
+    config: &CapConfig,
+) -> String {
+    let note = format!("The same fire as {}, under which it goes on.", heir.id);
+    envelope(Kind::Cancel, status(heir, config), heading, config)
+        .field("note", note)
+        .children(references(heading.earlier))
+        .field(
+            "incidents",
+            format_args!("{} {}", token(id), token(&heir.id)),
+        )
+        .document()
+}
+
+/// As far as `restriction`, which all messages share.
+fn envelope(kind: Kind, status: Status, heading: Heading<'_>, config: &CapConfig) -> Element {
     Element::new("alert")
         .with("xmlns", NAMESPACE)
-        .field("identifier", identifier)
+        .field("identifier", heading.identifier)
         .field("sender", &config.sender)
-        .field("sent", time(now))
-        .field("status", status(incident, config).word())
+        .field("sent", time(heading.sent))
+        .field("status", status.word())
         .field("msgType", kind.word())
         .field("source", "emberfix")
         .field("scope", "Restricted")
@@ -198,11 +235,6 @@ pub(super) fn message(
             "restriction",
             "Detected by a machine. For fire services; not for the public before a person decides so.",
         )
-        .children(note(kind, incident).map(|note| Element::leaf("note", note)))
-        .children(references(earlier).map(|text| Element::leaf("references", text)))
-        .field("incidents", token(&incident.id))
-        .child(info(kind, incident, config, now))
-        .document()
 }
 
 /// How a later message refers to this one.
@@ -222,14 +254,14 @@ pub(super) fn token(text: &str) -> String {
     text.chars().map(safe).collect()
 }
 
-fn references(earlier: &[String]) -> Option<String> {
+fn references(earlier: &[String]) -> Option<Element> {
     let (first, rest) = earlier.split_first()?;
     let latest = &rest[rest.len().saturating_sub(MAX_REFERENCES - 1)..];
     let all: Vec<&str> = std::iter::once(first)
         .chain(latest)
         .map(String::as_str)
         .collect();
-    Some(all.join(" "))
+    Some(Element::leaf("references", all.join(" ")))
 }
 
 /// While people train, nothing is in earnest.
@@ -238,11 +270,6 @@ fn status(incident: &Incident, config: &CapConfig) -> Status {
         Status::Actual if incident.exercise => Status::Exercise,
         status => status,
     }
-}
-
-fn note(kind: Kind, incident: &Incident) -> Option<String> {
-    let by = incident.operator.by.as_deref().unwrap_or("an operator");
-    (kind == Kind::Cancel).then(|| format!("Dismissed by {by}: no fire."))
 }
 
 fn certainty(incident: &Incident) -> &'static str {

@@ -1,14 +1,14 @@
 //! What was issued as CAP: on disk, so that names and references survive a restart and a message
 //! that was once read can be read again.
 
-use super::cap::{self, CapConfig, Issued, Kind, Stood};
+use super::cap::{self, CapConfig, Heading, Issued, Kind, Stood};
 use super::view;
 use super::xml::Element;
 use crate::ground::incident::Incident;
 use crate::ground::lock;
 use emberfix_frames::ServiceTime;
 use rusqlite::{Connection, OptionalExtension, params};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use std::sync::{Arc, Mutex};
 
@@ -24,6 +24,7 @@ CREATE TABLE IF NOT EXISTS cap (
     reference  TEXT NOT NULL, -- how later messages name this one
     xml        TEXT NOT NULL
 ) STRICT;
+CREATE INDEX IF NOT EXISTS cap_incident ON cap (incident);
 ";
 /// Messages that the feed lists, newest first.
 const LISTED: u32 = 200;
@@ -74,26 +75,27 @@ impl Issuer {
         })
     }
 
-    /// Issues what is due; the number of messages.
+    /// Issues what is due. `heir` is the incident that another went into, if it did.
     pub(super) fn issue(
         &self,
         incidents: &[Arc<Incident>],
+        heir: impl Fn(&str) -> Option<Arc<Incident>>,
         now: ServiceTime,
-    ) -> Result<usize, CapError> {
+    ) -> Result<(), CapError> {
         let mut kept = lock(&self.kept);
-        let due: Vec<_> = incidents
-            .iter()
-            .filter_map(|incident| {
-                Some((
-                    incident,
-                    cap::due(incident, kept.latest.get(&incident.id), now)?,
-                ))
-            })
-            .collect();
-        for (incident, kind) in &due {
-            kept.issue(incident, *kind, &self.config, now)?;
+        for incident in incidents {
+            if let Some(kind) = cap::due(incident, kept.latest.get(&incident.id), now) {
+                kept.tell(incident, kind, &self.config, now)?;
+            }
         }
-        Ok(due.len())
+        let gone = kept.gone(incidents);
+        for (id, heir) in gone
+            .into_iter()
+            .filter_map(|id| heir(&id).map(|heir| (id, heir)))
+        {
+            kept.cancel_merged(&id, &heir, &self.config, now)?;
+        }
+        Ok(())
     }
 
     /// One message as it was issued.
@@ -134,65 +136,114 @@ impl Issuer {
     }
 }
 
+/// A message that is about to be kept.
+struct Message<'a> {
+    id: &'a str,
+    kind: Kind,
+    title: String,
+    stood: Stood,
+    sent: ServiceTime,
+}
+
 impl Kept {
-    fn issue(
+    /// Incidents that were told, not taken back, and do not stand any more.
+    fn gone(&self, incidents: &[Arc<Incident>]) -> Vec<String> {
+        let standing: BTreeSet<&str> = incidents.iter().map(|i| i.id.as_str()).collect();
+        let told = self
+            .latest
+            .iter()
+            .filter(|(id, issued)| issued.kind != Kind::Cancel && !standing.contains(id.as_str()));
+        told.map(|(id, _)| id.clone()).collect()
+    }
+
+    fn tell(
         &mut self,
         incident: &Incident,
         kind: Kind,
         config: &CapConfig,
         now: ServiceTime,
     ) -> Result<(), CapError> {
-        let mut references = self
-            .latest
-            .get(&incident.id)
-            .map_or_else(Vec::new, |issued| issued.references.clone());
-        // A new Alert after a Cancel begins a new chain.
-        let earlier = if kind == Kind::Alert {
-            &[]
-        } else {
-            &references[..]
+        let message = Message {
+            id: &incident.id,
+            kind,
+            title: format!("{}: {}", kind.word(), view::callsign(incident)),
+            stood: Stood::of(incident),
+            sent: now,
         };
-        let identifier = self.name(incident)?;
-        let xml = cap::message(kind, incident, &identifier, earlier, config, now);
-        let reference = cap::reference(&config.sender, &identifier, now);
-        let stood = Stood::of(incident);
+        self.keep(message, config, |heading| {
+            cap::message(kind, incident, heading, config)
+        })
+    }
+
+    fn cancel_merged(
+        &mut self,
+        id: &str,
+        heir: &Incident,
+        config: &CapConfig,
+        now: ServiceTime,
+    ) -> Result<(), CapError> {
+        let message = Message {
+            id,
+            kind: Kind::Cancel,
+            title: format!("Cancel: {id} is {}", view::callsign(heir)),
+            stood: Stood::of(heir),
+            sent: now,
+        };
+        self.keep(message, config, |heading| {
+            cap::merged(id, heir, heading, config)
+        })
+    }
+
+    /// Names a message, writes it, and remembers it; on disk before anybody can read it.
+    fn keep(
+        &mut self,
+        message: Message<'_>,
+        config: &CapConfig,
+        write: impl FnOnce(Heading<'_>) -> String,
+    ) -> Result<(), CapError> {
+        // A new Alert after a Cancel begins a new chain.
+        let earlier = match (message.kind, self.latest.get(message.id)) {
+            (Kind::Alert, _) | (_, None) => Vec::new(),
+            (_, Some(issued)) => issued.references.clone(),
+        };
+        let identifier = self.name(message.id)?;
+        let heading = Heading {
+            identifier: &identifier,
+            earlier: &earlier,
+            sent: message.sent,
+        };
+        let reference = cap::reference(&config.sender, &identifier, message.sent);
         self.database.execute(
             "INSERT INTO cap (identifier, incident, kind, sent, title, stood, reference, xml)
              VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7, ?8)",
             params![
                 identifier,
-                incident.id,
-                kind.word(),
-                now.rfc3339(),
-                format!("{}: {}", kind.word(), view::callsign(incident)),
-                serde_json::to_string(&stood)?,
+                message.id,
+                message.kind.word(),
+                message.sent.rfc3339(),
+                message.title,
+                serde_json::to_string(&message.stood)?,
                 reference,
-                xml
+                write(heading)
             ],
         )?;
-        if kind == Kind::Alert {
-            references.clear();
-        }
+        let mut references = earlier;
         references.push(reference);
-        self.latest.insert(
-            incident.id.clone(),
-            Issued {
-                kind,
-                sent: now,
-                stood,
-                references,
-            },
-        );
+        let issued = Issued {
+            kind: message.kind,
+            sent: message.sent,
+            stood: message.stood,
+            references,
+        };
+        self.latest.insert(message.id.to_owned(), issued);
         Ok(())
     }
 
     /// `<incident>.<number of the message>`: never given twice.
-    fn name(&self, incident: &Incident) -> Result<String, CapError> {
+    fn name(&self, id: &str) -> Result<String, CapError> {
         let query = "SELECT count(*) FROM cap WHERE incident = ?1";
-        let before: i64 = self
-            .database
-            .query_row(query, [&incident.id], |row| row.get(0))?;
-        Ok(format!("{}.{}", cap::token(&incident.id), before + 1))
+        let before: i64 = self.database.query_row(query, [id], |row| row.get(0))?;
+        Ok(format!("{}.{}", cap::token(id), before + 1))
     }
 }
 

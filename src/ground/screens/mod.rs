@@ -145,8 +145,9 @@ fn newest_first(station: &Station) -> Incidents {
 
 async fn show(station: &Arc<Station>, incidents: Incidents, foxglove: Option<&foxglove::Foxglove>) {
     if let Some(cap) = station.screens.cap.clone() {
-        let incidents = Arc::clone(&incidents);
-        let issued = tokio::task::spawn_blocking(move || cap.issue(&incidents, now())).await;
+        let (incidents, known) = (Arc::clone(&incidents), Arc::clone(station));
+        let heir = move |id: &str| known.incident(id).filter(|heir| heir.id != id);
+        let issued = tokio::task::spawn_blocking(move || cap.issue(&incidents, heir, now())).await;
         if let Ok(Err(error)) = issued {
             tracing::error!(%error, "no CAP message could be issued");
         }

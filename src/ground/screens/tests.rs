@@ -1,6 +1,6 @@
 //! The rules of the screens, without sockets and without a clock.
 
-use super::cap::{self, CapConfig, Issued, Kind, Status, Stood};
+use super::cap::{self, CapConfig, Heading, Issued, Kind, Status, Stood};
 use super::cot::{self, Profile, Telling};
 use super::told::{Rhythm, Told, Word};
 use super::{kml, view};
@@ -223,7 +223,12 @@ fn an_exercise_is_never_told_in_earnest() {
         status: Status::Actual,
         radius_m: 500.0,
     };
-    let text = cap::message(Kind::Alert, &exercise, "x.1", &[], &config, at(0));
+    let heading = Heading {
+        identifier: "x.1",
+        earlier: &[],
+        sent: at(0),
+    };
+    let text = cap::message(Kind::Alert, &exercise, heading, &config);
     assert!(text.contains("<status>Exercise</status>"), "{text}");
     assert!(view::callsign(&exercise).starts_with("EXERCISE "));
 }
