@@ -39,7 +39,11 @@ def geojson(url):
     return {
         "content_type": kind,
         "features": [
-            {"id": f.get("id"), "geometry": f["geometry"]["type"], "coordinates": f["geometry"]["coordinates"]}
+            {
+                "id": f.get("id"),
+                "geometry": f["geometry"]["type"],
+                "coordinates": f["geometry"]["coordinates"],
+            }
             for f in features
         ],
     }
@@ -47,10 +51,10 @@ def geojson(url):
 
 def kml(url):
     from fastkml import kml as fast
-    from fastkml.utils import find_all
-    from fastkml.validator import validate
     from fastkml.containers import Document  # noqa: F401  (registers the classes)
     from fastkml.features import NetworkLink, Placemark
+    from fastkml.utils import find_all
+    from fastkml.validator import validate
 
     kind, body = fetch(url)
     document = fast.KML.from_string(body.split(b"?>", 1)[1].decode(), strict=True)
@@ -76,7 +80,11 @@ def kml(url):
     out = {"content_type": kind, "placemarks": places}
     if links:
         link = links[0].link
-        out["link"] = {"href": link.href, "interval_s": link.refresh_interval, "mode": link.refresh_mode.value}
+        out["link"] = {
+            "href": link.href,
+            "interval_s": link.refresh_interval,
+            "mode": link.refresh_mode.value,
+        }
         out["linked"] = kml(link.href)
     return out
 
@@ -116,7 +124,9 @@ def metrics(url):
     kind, body = fetch(url)
     families = text_string_to_metric_families(body.decode())
     samples = [
-        {"name": s.name, "labels": s.labels, "value": s.value, "type": f.type} for f in families for s in f.samples
+        {"name": s.name, "labels": s.labels, "value": s.value, "type": f.type}
+        for f in families
+        for s in f.samples
     ]
     return {"content_type": kind, "samples": samples}
 
@@ -144,10 +154,11 @@ def foxglove(url, seconds=10):
 
 
 def foxglove_facts(channel, data):
+    import base64
+
     from foxglove_schemas_protobuf.GeoJSON_pb2 import GeoJSON
     from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
     from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
-    import base64
 
     known = {"foxglove.GeoJSON": GeoJSON, "foxglove.LocationFix": LocationFix}
     kind = known.get(channel["schemaName"])
@@ -161,7 +172,11 @@ def foxglove_facts(channel, data):
     if channel["schemaName"] == "foxglove.GeoJSON":
         return {"schema": channel["schemaName"], "geojson": json.loads(message.geojson)}
     fixes = [
-        {"frame_id": f.frame_id, "place": [f.longitude, f.latitude, f.altitude], "covariance": list(f.position_covariance)}
+        {
+            "frame_id": f.frame_id,
+            "place": [f.longitude, f.latitude, f.altitude],
+            "covariance": list(f.position_covariance),
+        }
         for f in getattr(message, "fixes", [message])
     ]
     return {"schema": channel["schemaName"], "fixes": fixes}
@@ -191,7 +206,9 @@ READERS = {
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("kind", choices=READERS)
     parser.add_argument("source")
     args = parser.parse_args()

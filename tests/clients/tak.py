@@ -38,7 +38,7 @@ def certificates(args):
 
     folder = Path(args.folder)
     folder.mkdir(parents=True, exist_ok=True)
-    now = datetime.datetime.now(datetime.timezone.utc)
+    now = datetime.datetime.now(datetime.UTC)
 
     def make(name, issuer=None):
         key = ec.generate_private_key(ec.SECP256R1())
@@ -111,7 +111,7 @@ async def relay(args, stop):
 async def wait(stop, seconds):
     try:
         await asyncio.wait_for(stop.wait(), seconds)
-    except asyncio.TimeoutError:
+    except TimeoutError:
         pass
 
 
@@ -139,7 +139,7 @@ async def pytak_client(args, stop):
     while not stop.is_set() and len(events) < args.count and asyncio.get_event_loop().time() < ends:
         try:
             event = await asyncio.wait_for(tool.rx_queue.get(), 0.2)
-        except asyncio.TimeoutError:
+        except TimeoutError:
             continue
         events.append(event.decode() if isinstance(event, bytes) else event)
     running.cancel()
@@ -161,7 +161,7 @@ async def multicast(args, stop):
     while not stop.is_set() and len(datagrams) < args.count and loop.time() < ends:
         try:
             datagrams.append((await asyncio.wait_for(loop.sock_recv(receiver, 65536), 0.2)).decode())
-        except asyncio.TimeoutError:
+        except TimeoutError:
             continue
     return {"events": datagrams}
 
@@ -173,7 +173,9 @@ async def run(work, args):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("what", choices=["certificates", "relay", "pytak", "multicast"])
     parser.add_argument("folder", metavar="DIR or GROUP:PORT")
     parser.add_argument("--port", type=int, default=0)

@@ -9,6 +9,7 @@ import subprocess
 import mgrs
 import pyproj
 import pytest
+
 from conftest import HERE
 
 # Exceptions of the grid, edges of bands and zones, both sides of the equator and of the date line.
@@ -69,6 +70,10 @@ def test_where_there_is_no_utm_none_is_made_up():
     if not node:
         pytest.skip("no Node")
     run = subprocess.run(
-        [node, HERE / "coords_run.mjs"], input="[[84.1, 10], [-80.1, 10]]", capture_output=True, text=True, check=True
+        [node, HERE / "coords_run.mjs"],
+        input="[[84.1, 10], [-80.1, 10]]",
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert all(text["mgrs"] is None and text["utm"] is None for text in json.loads(run.stdout))
