@@ -10,8 +10,9 @@ use std::collections::BTreeMap;
 use std::net::TcpStream;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
-/// Each pair is shown this often, as a board that is held still would be.
-const TIMES: usize = 4;
+/// Each pair is shown this often, as a board that is held still would be; longer from round to round, for
+/// a machine that is too busy to look twice.
+const TIMES: [usize; 4] = [4, 8, 16, 32];
 /// From one picture to the next.
 const PERIOD: Duration = Duration::from_millis(120);
 
@@ -38,15 +39,18 @@ fn send(socket: TcpStream, pairs: &[[Bytes; 2]]) -> McapResult<()> {
         channel("/stereo/left/image")?,
         channel("/stereo/right/image")?,
     ];
-    for pair in pairs {
-        for _ in 0..TIMES {
-            let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap();
-            for (channel, png) in channels.into_iter().zip(pair) {
-                write(&mut writer, channel, png, now)?;
-            }
-            writer.flush()?;
-            std::thread::sleep(PERIOD);
+    let rounds = TIMES.iter().flat_map(|&times| {
+        pairs
+            .iter()
+            .flat_map(move |pair| std::iter::repeat_n(pair, times))
+    });
+    for pair in rounds {
+        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap();
+        for (channel, png) in channels.into_iter().zip(pair) {
+            write(&mut writer, channel, png, now)?;
         }
+        writer.flush()?;
+        std::thread::sleep(PERIOD);
     }
     writer.finish().map(drop)
 }
