@@ -174,7 +174,7 @@ fn before_a_camera_it_says_what_is_missing_and_ends_when_there_is_enough() {
         "28",
         "--json",
     ]);
-    command.args(["--live-limit-s", "120"]);
+    command.args(["--live-limit-s", "300"]);
     command.arg("--keep").arg(scratch.path("kept"));
     let (mut running, _) = Running::start(command, "show the board");
     let pairs = (1..=40).map(|number| {
