@@ -73,4 +73,9 @@ fn light_that_rises_by_five_percent_a_second_is_a_growing_fire() {
 fn a_spectrometer_that_dies_mid_fire_makes_no_dying_fire() {
     let (_, alarm) = flown(|k| (k < 100).then_some(40.0));
     assert_eq!(alarm["state"], "steady", "{alarm:#}");
+    let degraded = alarm["degraded"].as_array().unwrap();
+    assert!(
+        degraded.iter().any(|reason| reason == "spectral_silent"),
+        "the loss is not told: {alarm:#}"
+    );
 }

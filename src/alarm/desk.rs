@@ -33,8 +33,8 @@ pub struct Situation {
 /// Decides which fires to tell, and writes their alarms.
 ///
 /// A fire is told when it is confirmed. It is told again when its state changes, when it moved by
-/// more than half of the CE90 that was told, when CE90 fell below 0.7 of what was told, and every
-/// [`REPEAT_S`] while it is still seen; except for changes of state never more often than every
+/// more than half of the CE90 that was told, when CE90 fell below 0.7 of what was told, when a channel
+/// of its light was lost, and every [`REPEAT_S`] while it is still seen; except for changes of state never more often than every
 /// [`LEAST_S`], so that a busy scene leaves the link to new fires.
 #[derive(Debug)]
 pub struct AlarmDesk {
@@ -42,13 +42,15 @@ pub struct AlarmDesk {
     told: BTreeMap<FireId, Told>,
 }
 
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 struct Told {
     revision: u32,
     state: FireState,
     place: Wgs84,
     ce90_m: f64,
     captured_at: ServiceTime,
+    /// Channels that did not serve then.
+    lost: Vec<&'static str>,
 }
 
 /// Seconds after which a fire that is still seen is told again.
@@ -126,7 +128,10 @@ impl AlarmDesk {
         }
         let since_s = (fire.last_seen - told.captured_at).as_secs_f64();
         let moved_m = enu_offset(&told.place, &situation.place).xy().norm();
-        let changed = moved_m > MOVED * told.ce90_m || covariance.ce90_m() < BETTER * told.ce90_m;
+        let mut lost = situation.assessment.reasons.iter();
+        let changed = moved_m > MOVED * told.ce90_m
+            || covariance.ce90_m() < BETTER * told.ce90_m
+            || lost.any(|reason| !told.lost.contains(reason));
         since_s >= REPEAT_S || (changed && since_s >= LEAST_S)
     }
 
@@ -147,6 +152,7 @@ impl AlarmDesk {
                 place,
                 ce90_m,
                 captured_at: fire.last_seen,
+                lost: situation.assessment.reasons.clone(),
             },
         );
         Alarm {

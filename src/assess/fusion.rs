@@ -58,6 +58,23 @@ impl ChannelFault {
             (Channel::Visible, Self::Frozen) => "visible_frozen",
         }
     }
+
+    /// For the operator.
+    #[must_use]
+    pub fn words(self, channel: Channel) -> &'static str {
+        match (channel, self) {
+            (Channel::Spectral, Self::Silent) => "intensity without the spectrometer: it is silent",
+            (Channel::Spectral, Self::Blinded) => {
+                "intensity without the spectrometer: it is blinded"
+            }
+            (Channel::Spectral, Self::Frozen) => "intensity without the spectrometer: it is frozen",
+            (Channel::Visible, Self::Silent) => {
+                "intensity without the camera: no flame in its picture"
+            }
+            (Channel::Visible, Self::Blinded) => "intensity without the camera: it is blinded",
+            (Channel::Visible, Self::Frozen) => "intensity without the camera: its light is frozen",
+        }
+    }
 }
 
 /// The fire's intensity at one time.
@@ -406,6 +423,25 @@ mod tests {
         let middle = &fused[100];
         assert!(middle.rate < -3.0 * middle.rate_sigma, "{middle:?}");
         assert!((fused[150].level / (-0.02_f64 * 150.0).exp() - 1.0).abs() < 0.5);
+    }
+
+    #[test]
+    fn a_spike_that_the_printed_rule_follows_is_left_alone() {
+        let spiked = |k: usize, by: f64| {
+            let mut samples = steady(k);
+            if k == 80 {
+                samples[1] = samples[1].map(|value| (1.0 + by) * value);
+            }
+            samples
+        };
+        let level = |by: f64| run((0..90).map(|k| spiked(k, by)));
+        // E15: the printed weight lets at least half of a spike through.
+        for (with, without) in level(0.5).iter().zip(&level(0.0)) {
+            assert!(
+                (with.level - without.level).abs() < 0.03,
+                "{with:?} {without:?}"
+            );
+        }
     }
 
     #[test]

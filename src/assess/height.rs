@@ -145,7 +145,6 @@ mod tests {
                 sight,
                 range_m: 20.0,
                 flat_m: 18.0,
-                reaches: [None; 3],
             };
             (f64::from(k) * 0.5 - 10.0, look)
         };

@@ -4,13 +4,14 @@
 //! lines. **Out:** [`watch::Assessment`]: width, height, burning ground with their errors, intensity
 //! and its trend, direction and speed of the front; whether a small light flickers.
 //!
-//! [`outline`] turns boxes into metres, [`extent`] outlines into an oval and its motion, [`fusion`]
-//! two channels into one intensity, [`trend`] that into growing, steady or dying; [`watch`] keeps all
+//! [`outline`] turns boxes into rays and planes, [`extent`] those into size and, with `front`, into an
+//! oval and its motion, [`fusion`] two channels into one intensity, [`trend`] that into growing, steady or dying; [`watch`] keeps all
 //! of it per fire. [`printed`] is P1's fusion, to measure against.
 //!
 //! **Known limits.** A spectrometer sees the whole scene: its light is used while one fire is seen.
 
 pub mod extent;
+mod front;
 pub mod fusion;
 pub mod height;
 pub mod outline;

@@ -19,22 +19,9 @@ pub struct Look {
     right: Vector3<f64>,
     foot: Vector3<f64>,
     top: Vector3<f64>,
+    planes: [Vector3<f64>; 3],
     /// Jitter of one box edge that comes of pixels alone, radians.
     pub edge_rad: f64,
-}
-
-/// How far flame reaches in one direction over the ground.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Reach {
-    /// Unit vector, east and north.
-    pub outwards: Vector2<f64>,
-    /// From the anchor, metres.
-    pub metres: f64,
-    /// One sigma of what differs from look to look, metres.
-    pub sigma_m: f64,
-    /// How a reported camera that is a metre too high moves it, where it is the near edge's, metres;
-    /// 0 for the sides.
-    pub by_height: f64,
 }
 
 /// One look in metres.
@@ -53,16 +40,10 @@ pub struct InMetres {
     pub range_m: f64,
     /// Horizontal, from the camera to the near edge, metres.
     pub flat_m: f64,
-    /// To the right, to the left, and towards the camera where it looks down steeply enough.
-    pub reaches: [Option<Reach>; 3],
 }
 
 /// Jitter of a detector's box edge, pixels.
-const EDGE_PX: f64 = 1.5;
-/// Least tangent of the depression from which the lower edge places the near edge.
-const LEAST_SLOPE: f64 = 0.2;
-/// Flicker moves an edge by this share of the width.
-const FLICKER_SHARE: f64 = 0.06;
+const EDGE_PX: f64 = 1.0;
 
 impl Look {
     /// The rays of a sighting's box.
@@ -76,9 +57,16 @@ impl Look {
                 v: base.v - up * height,
             })
         };
+        let (low_left, low_right) = (ray(-0.5, 0.0), ray(0.5, 0.0));
+        let (high_left, high_right) = (ray(-0.5, 1.0), ray(0.5, 1.0));
         Self {
             at: sighting.at,
             camera: view.camera_enu,
+            planes: [
+                outward(&low_left, &high_left, &low_right),
+                outward(&low_right, &high_right, &low_left),
+                outward(&low_left, &low_right, &high_left),
+            ],
             left: ray(-0.5, 0.5),
             right: ray(0.5, 0.5),
             foot: ray(0.0, 0.0),
@@ -87,16 +75,36 @@ impl Look {
         }
     }
 
+    /// Where the camera was reported.
+    #[must_use]
+    pub fn camera(&self) -> &Vector3<f64> {
+        &self.camera
+    }
+
+    /// Planes through the camera in which the left side, the right side and the lower edge of the box
+    /// lie: unit normals that point away from the box.
+    #[must_use]
+    pub fn planes(&self) -> [Vector3<f64>; 3] {
+        self.planes
+    }
+
+    /// Half the box's width, metres at the distance of a point.
+    #[must_use]
+    pub fn half_width_m(&self, at: &Vector3<f64>) -> f64 {
+        0.5 * (self.right - self.left).norm() * (at - self.camera).norm()
+    }
+
+    /// The box's height, metres at the distance of a point.
+    #[must_use]
+    pub fn box_height_m(&self, at: &Vector3<f64>) -> f64 {
+        (self.top - self.foot).norm() * (at - self.camera).norm()
+    }
+
     /// The look in metres, when the middle of the burning ground is at `middle` and it is `depth_m`
-    /// deep; reaches count from `anchor`. The sides are taken at the middle, the height at the near
+    /// deep. The sides are taken at the middle, the height at the near
     /// edge. `None` when the camera is right above, or a ray misses.
     #[must_use]
-    pub fn in_metres(
-        &self,
-        middle: &Vector3<f64>,
-        depth_m: f64,
-        anchor: &Vector2<f64>,
-    ) -> Option<InMetres> {
+    pub fn in_metres(&self, middle: &Vector3<f64>, depth_m: f64) -> Option<InMetres> {
         let foot = self.near_edge(middle, depth_m)?;
         let to_foot = foot - self.camera;
         let flat_m = to_foot.xy().norm();
@@ -113,30 +121,13 @@ impl Look {
         let (low, top) = (at(&self.foot, flat_m)?, at(&self.top, flat_m)?);
         let to_right = Vector2::new(sight.y, -sight.x);
         let width_m = (right - left).xy().dot(&to_right);
-        let range_m = to_foot.norm();
-        let sigma_m = (range_m * self.edge_rad).hypot(FLICKER_SHARE * width_m);
-        let slope = -to_foot.z / flat_m;
-        let reach = |outwards: Vector2<f64>, point: Vector2<f64>, sigma_m, by_height| Reach {
-            outwards,
-            metres: (point - anchor).dot(&outwards),
-            sigma_m,
-            by_height,
-        };
-        let near = (slope > LEAST_SLOPE)
-            .then(|| self.on_ground(foot.z))
-            .flatten();
         Some(InMetres {
             width_m,
             apparent_height_m: top.z - low.z,
-            slope,
+            slope: -to_foot.z / flat_m,
             sight,
-            range_m,
+            range_m: to_foot.norm(),
             flat_m,
-            reaches: [
-                Some(reach(to_right, right.xy(), sigma_m, 0.0)),
-                Some(reach(-to_right, left.xy(), sigma_m, 0.0)),
-                near.map(|near| reach(-sight, near, sigma_m / slope.min(1.0), -1.0 / slope)),
-            ],
         })
     }
 
@@ -154,11 +145,37 @@ impl Look {
         let behind = sight.unwrap_or_default() * (depth_m / 2.0);
         foot + Vector3::new(behind.x, behind.y, 0.0)
     }
+}
 
-    /// Where the lower edge's ray meets the level of the foot.
-    fn on_ground(&self, level: f64) -> Option<Vector2<f64>> {
-        let down = (level - self.camera.z) / self.foot.z;
-        (down > 0.0).then(|| self.camera.xy() + self.foot.xy() * down)
+#[cfg(test)]
+impl Look {
+    /// A look that is known by its planes and the rays through the middles of the box's sides.
+    pub(super) fn by_planes(
+        at: ServiceTime,
+        camera: Vector3<f64>,
+        planes: [Vector3<f64>; 3],
+        [left, right, foot, top]: [Vector3<f64>; 4],
+    ) -> Self {
+        Self {
+            at,
+            camera,
+            left,
+            right,
+            foot,
+            top,
+            planes,
+            edge_rad: 1e-3,
+        }
+    }
+}
+
+/// Normal of the plane through two rays, away from a third; unit.
+fn outward(one: &Vector3<f64>, other: &Vector3<f64>, inside: &Vector3<f64>) -> Vector3<f64> {
+    let normal = one.cross(other).try_normalize(0.0).unwrap_or_default();
+    if normal.dot(inside) > 0.0 {
+        -normal
+    } else {
+        normal
     }
 }
 
@@ -195,23 +212,28 @@ mod tests {
     #[test]
     fn a_box_is_as_many_metres_wide_and_high_as_the_range_makes_it() {
         let (look, foot) = look();
-        let metres = look.in_metres(&foot, 0.0, &foot.xy()).unwrap();
+        let metres = look.in_metres(&foot, 0.0).unwrap();
         assert!((metres.width_m - 4.0).abs() < 1e-6, "{metres:?}");
         assert!((metres.apparent_height_m - 3.0).abs() < 1e-6);
-        let [right, left, near] = metres.reaches.map(Option::unwrap);
-        assert!((right.outwards - Vector2::x()).norm() < 1e-6 && (right.metres - 2.0).abs() < 1e-6);
-        assert!((left.outwards + Vector2::x()).norm() < 1e-6 && (left.metres - 2.0).abs() < 1e-6);
-        assert!((near.outwards + Vector2::y()).norm() < 1e-6 && near.metres.abs() < 1e-6);
+        // The box's sides pass the fire at half its width, its lower edge touches the foot.
+        let support = look
+            .planes()
+            .map(|normal| normal.dot(&(look.camera() - foot)));
+        assert!((support[0] / 2.0 - 1.0).abs() < 0.02, "{support:?}");
+        assert!((support[1] / 2.0 - 1.0).abs() < 0.02, "{support:?}");
+        assert!(support[2].abs() < 1e-6, "{support:?}");
+        assert!(look.planes()[0].x < -0.9 && look.planes()[1].x > 0.9);
+        assert!(look.planes()[2].y < 0.0 && look.planes()[2].z < 0.0);
         // Twice as far, twice as large.
         let camera = foot - Vector3::new(0.0, 20.0, -10.0);
         let far = camera + (foot - camera) * 2.0;
-        assert!((look.in_metres(&far, 0.0, &far.xy()).unwrap().width_m - 8.0).abs() < 1e-6);
+        assert!((look.in_metres(&far, 0.0).unwrap().width_m - 8.0).abs() < 1e-6);
     }
 
     #[test]
     fn from_right_above_there_is_no_size() {
         let (look, foot) = look();
         let beneath = Vector3::new(foot.x, foot.y - 20.0 + 0.1, foot.z);
-        assert_eq!(look.in_metres(&beneath, 0.0, &beneath.xy()), None);
+        assert_eq!(look.in_metres(&beneath, 0.0), None);
     }
 }

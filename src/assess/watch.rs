@@ -116,6 +116,18 @@ impl Assessor {
         self.fires.get(&fire).map(|watched| &watched.now)
     }
 
+    /// Which channels of which fires' light do not serve, for the operator; each once.
+    #[must_use]
+    pub fn warnings(&self) -> Vec<&'static str> {
+        let faults = self.fires.values().filter_map(|watched| watched.last);
+        let told = faults.flat_map(|(_, fused)| {
+            let channels = super::fusion::Channel::ALL.into_iter().zip(fused.faults);
+            channels.filter_map(|(channel, fault)| Some(fault?.words(channel)))
+        });
+        let words: std::collections::BTreeSet<&'static str> = told.collect();
+        words.into_iter().collect()
+    }
+
     /// Forgets the fires that are not kept.
     pub fn keep(&mut self, kept: impl Fn(FireId) -> bool) {
         self.fires.retain(|fire, _| kept(*fire));
@@ -147,6 +159,7 @@ fn standing(
             wander(view.pose.gnss_horizontal_m),
             wander(view.pose.gnss_vertical_m),
         ),
+        turn_rad: (view.priors().heading_rad, view.priors().tilt_rad),
     }
 }
 

@@ -208,7 +208,8 @@ impl Pipeline {
         }
         problems.extend(self.blind.clone());
         let faults = self.check.faults().iter();
-        let warnings = faults.map(|fault| fault.words()).collect();
+        let mut warnings: Vec<&'static str> = faults.map(|fault| fault.words()).collect();
+        warnings.extend(self.assessor.warnings());
         Health { problems, warnings }
     }
 

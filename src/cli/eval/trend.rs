@@ -21,10 +21,16 @@ pub struct TrendArguments {
     /// Rendered flights for size and spread; 0 leaves them out.
     #[arg(long, default_value_t = 400)]
     flights: usize,
+    /// The first noise model and 60 flights only: a minute or two.
+    #[arg(long)]
+    quick: bool,
     /// Rig of the rendered flights.
     #[arg(long, default_value = "calib/rigs/oakd-75mm.toml")]
     rig: PathBuf,
 }
+
+/// Flights of a quick run.
+const QUICK_FLIGHTS: usize = 60;
 
 #[derive(Debug, Clone, Copy, clap::ValueEnum)]
 enum Set {
@@ -48,8 +54,16 @@ pub fn trend(arguments: &TrendArguments) -> Result<(), Failure> {
     let rig = Rig::load(&arguments.rig).map_err(|error| Failure::Refused(error.into()))?;
     let options = Options {
         seed: arguments.seed,
-        sets: arguments.set.into(),
-        flights: arguments.flights,
+        sets: if arguments.quick {
+            Sets::First
+        } else {
+            arguments.set.into()
+        },
+        flights: if arguments.quick {
+            arguments.flights.min(QUICK_FLIGHTS)
+        } else {
+            arguments.flights
+        },
     };
     let contests = if options.sets == Sets::Both { 2 } else { 1 };
     let steps = (contests * GROUPS * BURNS + options.flights) as u64;

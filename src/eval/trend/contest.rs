@@ -35,6 +35,8 @@ pub struct Contest {
     /// What the printed and the turned fusion would score if the two samples by which their window
     /// looks ahead were given to them: percent.
     pub aligned: [f64; 2],
+    /// What flies with the spectral, with the visible channel alone: percent.
+    pub alone: [f64; 2],
 }
 
 impl Contest {
@@ -72,6 +74,7 @@ impl Contest {
         Self {
             overall: columns.map(mean_of).collect(),
             aligned: [0, 1].map(|k| of(&burns, Method::ALL.len() + k).mean),
+            alone: [2, 3].map(|k| of(&burns, Method::ALL.len() + k).mean),
             groups,
             model,
             seed,
@@ -154,6 +157,7 @@ fn scores(burn: &Burn) -> Vec<f64> {
         .map(|method| method.accuracy(burn))
         .collect();
     scores.extend([Method::Printed, Method::Turned].map(|method| method.accuracy_aligned(burn)));
+    scores.extend([0, 1].map(|channel| Method::accuracy_alone(burn, channel)));
     scores
 }
 

@@ -77,6 +77,8 @@ impl Pair {
 /// What one flight came to.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Outcome {
+    /// Seed of the flight.
+    pub seed: u64,
     /// Metres from the camera to the fire's ignition at the end.
     pub range_m: f64,
     /// Metres.
@@ -145,7 +147,8 @@ pub fn fly(rig: &Rig, seed: u64, flight: usize) -> Result<Option<Outcome>, Fligh
             watch.look(label, &body, t_s, &mut rng);
         }
     }
-    Ok(watch.outcome(&scene, &truth, &mut rng))
+    let outcome = watch.outcome(&scene, &truth);
+    Ok(outcome.map(|outcome| Outcome { seed, ..outcome }))
 }
 
 impl Scene {
@@ -394,10 +397,11 @@ impl<'a> Watch<'a> {
                 GNSS_M.0 * (2.0 / GNSS_S).sqrt(),
                 GNSS_M.1 * (2.0 / GNSS_S).sqrt(),
             ),
+            turn_rad: (HEADING_RAD, TILT_RAD),
         })
     }
 
-    fn outcome(&self, scene: &Scene, truth: &FireTruth, _rng: &mut ChaCha8Rng) -> Option<Outcome> {
+    fn outcome(&self, scene: &Scene, truth: &FireTruth) -> Option<Outcome> {
         let standing = self.standing(scene)?;
         let extent = self.outline.extent(&standing, scene.wind.as_ref())?;
         let t_s = self.last_t_s;
@@ -423,6 +427,7 @@ impl Outcome {
             pair(told.azimuth_deg, told.azimuth_deg.value + off)
         });
         Self {
+            seed: 0,
             range_m: scene.range_m,
             width: pair(extent.width_m, width),
             height: pair(extent.height_m, height),

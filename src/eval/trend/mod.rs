@@ -7,6 +7,7 @@
 
 pub mod burns;
 pub mod contest;
+mod coverage;
 pub mod flights;
 pub mod score;
 
@@ -17,6 +18,7 @@ use emberfix_report::{Axis, Bound, Chart, Figure, Mark, Series, Sheet};
 use flights::{FlightError, Outcome, Pair};
 use rayon::prelude::*;
 use score::Method;
+use std::collections::BTreeSet;
 
 /// What is measured.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -25,9 +27,12 @@ pub struct Options {
     pub seed: u64,
     /// The first noise model, the second, or both.
     pub sets: Sets,
-    /// Rendered flights; half of the fires run.
+    /// Rendered flights, in turn of [`FLIGHT_SEEDS`] seeds from `seed`; two in three of the fires run.
     pub flights: usize,
 }
+
+/// Seeds that the flights come from.
+pub const FLIGHT_SEEDS: usize = 2;
 
 /// Which noise models are run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -55,7 +60,8 @@ pub fn measure(
     let flown: Vec<Option<Outcome>> = (0..options.flights)
         .into_par_iter()
         .map(|flight| {
-            let outcome = flights::fly(rig, options.seed, flight);
+            let seed = options.seed + (flight % FLIGHT_SEEDS) as u64;
+            let outcome = flights::fly(rig, seed, flight / FLIGHT_SEEDS);
             told();
             outcome
         })
@@ -78,6 +84,7 @@ pub fn measure(
     }
     if !flown.is_empty() {
         tables.push(flight_table(&flown));
+        tables.push(coverage::table(&interval_rows(&flown)));
         plots.push(("trend_size_and_spread".to_owned(), flight_sheet(&flown)));
     }
     Ok(Report {
@@ -89,6 +96,7 @@ pub fn measure(
             "dead_band_per_sample": score::DEAD_BAND,
             "seed": options.seed,
             "flights": flown,
+            "coverage90": coverage::details(&interval_rows(&flown)),
         }),
         tables,
         plots,
@@ -117,6 +125,8 @@ fn first_figures(contest: &Contest) -> Vec<Figure> {
         told(Method::Turned),
         Figure::told("trend.printed_aligned", Some(contest.aligned[0]), "%", n),
         Figure::told("trend.turned_aligned", Some(contest.aligned[1]), "%", n),
+        Figure::told("trend.ours_spectral_alone", Some(contest.alone[0]), "%", n),
+        Figure::told("trend.ours_visible_alone", Some(contest.alone[1]), "%", n),
     ]
 }
 
@@ -209,8 +219,7 @@ fn flight_figures(flown: &[Outcome]) -> Vec<Figure> {
             15.0,
             azimuths.len(),
         ),
-        coverage("spread.speed_coverage90", &speeds),
-        coverage("spread.direction_coverage90", &azimuths),
+        coverage("spread.coverage90", &[speeds.clone(), azimuths].concat()),
         Figure::told(
             "spread.told_share",
             share(speeds.len(), running),
@@ -218,6 +227,17 @@ fn flight_figures(flown: &[Outcome]) -> Vec<Figure> {
             running,
         ),
         Figure::told("spread.false_share", share(wrongly, still), "", still),
+    ]
+}
+
+/// What the 90 % intervals are counted over.
+fn interval_rows(flown: &[Outcome]) -> Vec<(&'static str, Vec<Pair>)> {
+    let of = |pick: fn(&Outcome) -> Option<Pair>| flown.iter().filter_map(pick).collect();
+    vec![
+        ("width", of(|outcome| Some(outcome.width))),
+        ("height", of(|outcome| Some(outcome.height))),
+        ("speed of the head", of(|outcome| outcome.speed)),
+        ("direction of the head", of(|outcome| outcome.azimuth)),
     ]
 }
 
@@ -231,18 +251,29 @@ fn flight_table(flown: &[Outcome]) -> Table {
     let percent = |pairs: &[Pair]| {
         rms(pairs, |p| 100.0 * p.share()).map_or("-".to_owned(), |value| format!("{value:.1}"))
     };
-    let rows = bands.map(|(low, high)| {
-        let inside: Vec<Outcome> = flown
-            .iter()
-            .filter(|outcome| (low..high).contains(&outcome.range_m))
-            .copied()
-            .collect();
+    let seeds: BTreeSet<u64> = flown.iter().map(|outcome| outcome.seed).collect();
+    let mut kinds: Vec<(String, Vec<Outcome>)> = bands
+        .map(|(low, high)| {
+            let inside = flown
+                .iter()
+                .filter(|outcome| (low..high).contains(&outcome.range_m));
+            (
+                format!("{low:.0} to {high:.0} m"),
+                inside.copied().collect(),
+            )
+        })
+        .to_vec();
+    kinds.extend(seeds.into_iter().map(|seed| {
+        let inside = flown.iter().filter(|outcome| outcome.seed == seed);
+        (format!("seed {seed}"), inside.copied().collect())
+    }));
+    let rows = kinds.into_iter().map(|(name, inside)| {
         let of = |pick: fn(&Outcome) -> Option<Pair>| -> Vec<Pair> {
             inside.iter().filter_map(pick).collect()
         };
         let azimuths = of(|outcome| outcome.azimuth);
         vec![
-            format!("{low:.0} to {high:.0}"),
+            name,
             inside.len().to_string(),
             percent(&of(|outcome| Some(outcome.width))),
             percent(&of(|outcome| Some(outcome.height))),
@@ -252,7 +283,7 @@ fn flight_table(flown: &[Outcome]) -> Table {
         ]
     });
     let header = [
-        "range, m",
+        "range or seed",
         "fires",
         "width, %",
         "height, %",
@@ -263,7 +294,7 @@ fn flight_table(flown: &[Outcome]) -> Table {
     Table {
         title: "Errors (root of the mean square) on rendered fires".to_owned(),
         header: header.map(str::to_owned).to_vec(),
-        rows: rows.to_vec(),
+        rows: rows.collect(),
     }
 }
 

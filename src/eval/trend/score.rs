@@ -70,6 +70,12 @@ impl Method {
         accuracy(&signal, &scaled(&burn.truth))
     }
 
+    /// What flies, with one of its channels alone: shows what fusing adds to filtering.
+    #[must_use]
+    pub fn accuracy_alone(burn: &Burn, channel: usize) -> f64 {
+        accuracy(&ours(burn, |kept| kept == channel), &scaled(&burn.truth))
+    }
+
     /// The method's signal, as it can be known at each sample.
     #[must_use]
     pub fn signal(self, burn: &Burn) -> Vec<f64> {
@@ -79,7 +85,7 @@ impl Method {
             Self::Visible => visible,
             Self::Printed => late(&fuse(&spectral, &visible, RADIUS, Weight::Printed)),
             Self::Turned => late(&fuse(&spectral, &visible, RADIUS, Weight::Turned)),
-            Self::Ours => ours(burn),
+            Self::Ours => ours(burn, |_| true),
         }
     }
 
@@ -90,14 +96,17 @@ impl Method {
     }
 }
 
-/// Raw samples into the filter that flies, scaled as the others are.
-fn ours(burn: &Burn) -> Vec<f64> {
+/// Raw samples of the channels that are kept into the filter that flies, scaled as the others are.
+fn ours(burn: &Burn, keeps: impl Fn(usize) -> bool) -> Vec<f64> {
     let mut fusion = Fusion::default();
     let mut level = 1.0;
     let told = burn.spectral.iter().zip(&burn.visible);
     let told = told.map(|(spectral, visible)| {
         level = fusion
-            .step(STEP_S, [*spectral, *visible])
+            .step(
+                STEP_S,
+                [spectral.filter(|_| keeps(0)), visible.filter(|_| keeps(1))],
+            )
             .map_or(level, |fused| fused.level);
         level
     });
