@@ -115,7 +115,7 @@ const DEPTH: f64 = 1.0;
 const DEPTH_SIGMA: f64 = 0.4;
 /// Spread is told from this many sigmas of its speed, and below this sigma of its direction.
 const SURE: f64 = 3.0;
-const SURE_DEG: f64 = 20.0;
+const SURE_DEG: f64 = 15.0;
 /// Share of the speed, and degrees, that the oval itself is wrong by: fires are no ellipses.
 const SPEED_SHARE: f64 = 0.06;
 const DIRECTION_DEG: f64 = 5.0;
