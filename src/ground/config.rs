@@ -3,8 +3,10 @@
 
 use super::doors::{self, Doors, RawDoors};
 use super::screens::config::{self as screens, RawScreens, ScreensConfig};
+use super::receive::Keyring;
+use crate::deliver::keys::PublicKey;
 use emberfix_calib::{KeyProblem, toml_problem, unknown_keys};
-use emberfix_mav::{LinkUrl, LinkUrlError};
+use emberfix_mav::{LinkUrl, LinkUrlError, SigningKey};
 use serde::Deserialize;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -63,6 +65,15 @@ pub struct GroundConfig {
     pub(super) uavs: Vec<Uav>,
     pub(super) screens: ScreensConfig,
     pub(super) doors: Doors,
+    pub(super) datagrams: bool,
+}
+
+impl GroundConfig {
+    /// Whose word counts.
+    pub(super) fn keyring(&self) -> Keyring {
+        let named = |uav: &Uav| (uav.name.clone(), uav.public_key);
+        Keyring::new(self.uavs.iter().map(named))
+    }
 }
 
 /// The ground agent's end of MAVLink.
@@ -71,6 +82,7 @@ pub(super) struct MavlinkConfig {
     pub url: LinkUrl,
     pub system_id: u8,
     pub component_id: u8,
+    pub signing_key: Option<SigningKey>,
 }
 
 /// Which aircraft flies under which MAVLink system id.
@@ -78,6 +90,7 @@ pub(super) struct MavlinkConfig {
 pub(super) struct Uav {
     pub system_id: u8,
     pub name: String,
+    pub public_key: Option<PublicKey>,
 }
 
 #[derive(Deserialize)]
@@ -97,6 +110,12 @@ struct RawConfig {
     screens: RawScreens,
     #[serde(flatten)]
     doors: RawDoors,
+    #[serde(default = "yes")]
+    datagrams: bool,
+}
+
+fn yes() -> bool {
+    true
 }
 
 #[derive(Deserialize)]
@@ -106,12 +125,25 @@ struct RawMavlink {
     system_id: i64,
     #[serde(default = "default_component_id")]
     component_id: i64,
+    signing_key: Option<PathBuf>,
+}
+
+impl RawMavlink {
+    fn usual() -> Self {
+        Self {
+            url: String::new(),
+            system_id: default_system_id(),
+            component_id: default_component_id(),
+            signing_key: None,
+        }
+    }
 }
 
 #[derive(Deserialize)]
 struct RawUav {
     system_id: i64,
     name: String,
+    public_key: Option<String>,
 }
 
 fn default_listen() -> String {
@@ -135,8 +167,11 @@ const KNOWN: &[&str] = &[
     "mavlink.url",
     "mavlink.system_id",
     "mavlink.component_id",
+    "mavlink.signing_key",
+    "datagrams",
     "uav.system_id",
     "uav.name",
+    "uav.public_key",
 ];
 
 impl GroundConfig {
@@ -208,17 +243,10 @@ fn check(
     }
     let mut mavlink = raw.mavlink;
     if let Some(url) = overrides.mavlink_url {
-        let (system_id, component_id) = mavlink.map_or_else(
-            || (default_system_id(), default_component_id()),
-            |given| (given.system_id, given.component_id),
-        );
-        mavlink = Some(RawMavlink {
-            url,
-            system_id,
-            component_id,
-        });
+        let given = mavlink.unwrap_or_else(RawMavlink::usual);
+        mavlink = Some(RawMavlink { url, ..given });
     }
-    let mavlink = mavlink.and_then(|link| check_mavlink(link, problems));
+    let mavlink = mavlink.and_then(|link| check_mavlink(link, folder, problems));
     let uavs = check_uavs(&raw.uav, problems);
     let vehicle = mavlink.as_ref().map(|link| &link.url);
     let screens = raw.screens.check(folder, vehicle, problems);
@@ -233,6 +261,7 @@ fn check(
         uavs,
         screens,
         doors,
+        datagrams: raw.datagrams,
     })
 }
 
@@ -246,7 +275,15 @@ fn address(text: &str, problems: &mut Vec<String>) -> Option<SocketAddr> {
     parsed
 }
 
-fn check_mavlink(raw: RawMavlink, problems: &mut Vec<String>) -> Option<MavlinkConfig> {
+fn check_mavlink(
+    raw: RawMavlink,
+    folder: &Path,
+    problems: &mut Vec<String>,
+) -> Option<MavlinkConfig> {
+    let signing_key = raw.signing_key.map(|path| {
+        crate::mission::load_signing_key(&folder.join(path))
+            .map_err(|problem| problems.push(format!("mavlink.signing_key: {problem}")))
+    });
     let system_id = id("mavlink.system_id", raw.system_id, problems);
     let component_id = id("mavlink.component_id", raw.component_id, problems);
     let url = raw
@@ -258,6 +295,7 @@ fn check_mavlink(raw: RawMavlink, problems: &mut Vec<String>) -> Option<MavlinkC
         url: url?,
         system_id: system_id?,
         component_id: component_id?,
+        signing_key: signing_key.transpose().ok()?,
     })
 }
 
@@ -290,9 +328,15 @@ fn check_uavs(raw: &[RawUav], problems: &mut Vec<String>) -> Vec<Uav> {
                 uav.name
             ));
         }
+        let public_key = uav.public_key.as_deref().map(str::parse).transpose();
+        let public_key = public_key.unwrap_or_else(|error| {
+            problems.push(format!("uav.public_key of {:?}: {error}", uav.name));
+            None
+        });
         uavs.push(Uav {
             system_id,
             name: uav.name.clone(),
+            public_key,
         });
     }
     uavs

@@ -8,9 +8,11 @@ mod incidents;
 
 use super::access::{self, Access, Caller, Doorkeeper};
 use super::events::{self, MAX_STREAMS, Show};
-use super::store::{Completeness, Kept, StoreError};
+use super::store::{Kept, StoreError};
 use super::tracks::Source;
 use super::{Ping, ReceiveError, Station, lock, now};
+use crate::deliver::envelope;
+use crate::deliver::http::{RECEIPT_HEADER, WIRE_KIND};
 use axum::body::Bytes;
 use axum::extract::rejection::BytesRejection;
 use axum::extract::{DefaultBodyLimit, Query, Request, State};
@@ -50,6 +52,7 @@ pub(super) fn router(
         .merge(super::screens::routes())
         .route("/alarms", post(post_alarm))
         .route("/alarms/test", post(post_test))
+        .route("/wire", post(post_wire))
         .route("/alarms.geojson", get(alarms))
         .route("/incidents.geojson", get(incidents::collection))
         .route("/incidents/changes", get(incidents::changes))
@@ -251,7 +254,11 @@ async fn post_alarm(
     if let Some(refused) = speaks(&caller, &body) {
         return refused;
     }
-    let (alarm, kept) = match station.receive(&body, LINK_NAME, Completeness::Full).await {
+    let header = headers
+        .get(envelope::HTTP_HEADER)
+        .and_then(|h| h.to_str().ok());
+    let received = station.reception.http(&station, header, &body, LINK_NAME);
+    let (alarm, kept, signed) = match received.await {
         Ok(received) => received,
         Err(error) => return not_taken(&error),
     };
@@ -261,7 +268,33 @@ async fn post_alarm(
     };
     let properties = alarm.properties;
     let receipt = json!({ "id": properties.id, "revision": properties.revision, "stored": true });
-    (status, axum::Json(receipt)).into_response()
+    let signed = signed.and_then(|signed| HeaderValue::from_str(&signed).ok());
+    let signed = signed.map(|signed| [(HeaderName::from_static(RECEIPT_HEADER), signed)]);
+    (status, signed, axum::Json(receipt)).into_response()
+}
+
+/// One datagram of the wire, and its answer, for aircraft that no datagram leaves.
+///
+/// Its kind is one that a foreign page can't send unasked.
+async fn post_wire(
+    State(station): Shared,
+    headers: HeaderMap,
+    body: Result<Bytes, BytesRejection>,
+) -> Response {
+    let kind = headers.get(header::CONTENT_TYPE);
+    let answer = match body {
+        Ok(body) if kind.is_some_and(|kind| kind == WIRE_KIND) => {
+            station.reception.datagram(&station, &body).await
+        }
+        _ => None,
+    };
+    match answer {
+        Some(answer) => ([(header::CONTENT_TYPE, WIRE_KIND)], answer).into_response(),
+        None => refusal(
+            StatusCode::BAD_REQUEST,
+            "no datagram that this station answers",
+        ),
+    }
 }
 
 /// An alarm that is only a test: checked as a real one and shown as a test, kept nowhere.
@@ -291,9 +324,12 @@ async fn post_test(
 
 fn not_taken(error: &ReceiveError) -> Response {
     let status = match error {
-        ReceiveError::Alarm(_) | ReceiveError::Covariance { .. } => StatusCode::BAD_REQUEST,
+        ReceiveError::Alarm(_) | ReceiveError::Covariance { .. } | ReceiveError::Envelope(_) => {
+            StatusCode::BAD_REQUEST
+        }
+        ReceiveError::Trust(_) => StatusCode::FORBIDDEN,
         ReceiveError::Store(StoreError::Conflict { .. }) => StatusCode::CONFLICT,
-        ReceiveError::Store(_) => StatusCode::SERVICE_UNAVAILABLE,
+        ReceiveError::Store(_) | ReceiveError::Ledger(_) => StatusCode::SERVICE_UNAVAILABLE,
     };
     refusal(status, error)
 }
@@ -390,6 +426,7 @@ async fn health(State(station): Shared) -> Response {
         "status": "ok",
         "version": env!("CARGO_PKG_VERSION"),
         "now": now().rfc3339(),
+        "wire": station.reception.health(),
         "store": station.store.id(),
         "incidents": census.incidents,
         "alarms": census.alarms,

@@ -36,14 +36,17 @@ mod bus;
 mod bus_tests;
 pub mod chips;
 pub mod config;
+mod datagram;
 mod doors;
 mod events;
 mod http;
 pub mod incident;
+mod ledger;
 mod mavlink;
 mod merge;
 mod page;
 mod screens;
+pub mod receive;
 mod server;
 pub mod store;
 #[cfg(test)]
@@ -127,6 +130,12 @@ pub enum GroundError {
         /// Which, and why.
         reason: String,
     },
+    /// The receiving end can't be opened.
+    #[error(transparent)]
+    Reception(#[from] receive::ReceptionError),
+    /// MAVLink signing has no state to go on from.
+    #[error(transparent)]
+    Signing(#[from] crate::deliver::signing_file::SigningFileError),
     /// The MAVLink port can't be opened.
     #[error(transparent)]
     Mavlink(#[from] LinkError),
@@ -162,6 +171,15 @@ pub enum ReceiveError {
     /// It could not be kept.
     #[error(transparent)]
     Store(#[from] StoreError),
+    /// It is not who it says it is.
+    #[error(transparent)]
+    Trust(#[from] receive::TrustError),
+    /// Its signed head can't be read.
+    #[error(transparent)]
+    Envelope(#[from] crate::deliver::envelope::EnvelopeError),
+    /// It could not be entered into the books.
+    #[error(transparent)]
+    Ledger(#[from] ledger::LedgerError),
 }
 
 /// Runs the ground station until SIGINT or SIGTERM.
@@ -178,6 +196,10 @@ pub async fn run(config: &Path, overrides: Overrides) -> Result<(), GroundError>
     };
     let ground = Ground::start(config).await?;
     // The line that people and programs wait for; with port 0 only it knows the port.
+    eprintln!(
+        "emberfix ground: this station's public key, for missions: [ground] public_key = \"{}\"",
+        ground.station.reception.public_key()
+    );
     eprintln!(
         "emberfix ground: {scheme}://{} keeps alarms in {}",
         ground.address(),
@@ -212,15 +234,18 @@ impl Ground {
     /// [`GroundError`] when the store or the address can't be opened.
     pub async fn start(config: GroundConfig) -> Result<Self, GroundError> {
         let door = door(&config)?;
+        let signed = config.keyring().has_keys();
         let station = Arc::new(Station::open(&config, Arc::clone(&door.turned)).await?);
         if let Some(bus) = config.doors.bus.clone() {
             tokio::spawn(bus::run(Arc::clone(&station), bus));
         }
         if let Some(mavlink) = config.mavlink {
             let link = Link::open(&mavlink.url).await?;
+            let signing = mavlink::open_signing(&mavlink, &config.data_dir)?;
             tokio::spawn(mavlink::run(
                 Arc::clone(&station),
                 link,
+                signing,
                 mavlink,
                 config.uavs,
             ));
@@ -234,6 +259,11 @@ impl Ground {
             .await
             .map_err(in_use)?;
         let address = socket.local_addr().map_err(in_use)?;
+        // Beyond this machine, only signed datagrams: nothing else says who sends.
+        if config.datagrams && (address.ip().is_loopback() || signed) {
+            let socket = tokio::net::UdpSocket::bind(address).await.map_err(in_use)?;
+            tokio::spawn(datagram::run(Arc::clone(&station), socket));
+        }
         let names = Arc::from(config.host_names.as_slice());
         let app = http::router(Arc::clone(&station), names, config.doors.accesses);
         let server = server::serve(socket, app, door, station.stopping.subscribe());
@@ -326,6 +356,7 @@ pub(crate) struct Station {
     turned: Arc<Turned>,
     /// Requests that were refused, by HTTP status.
     refusals: Mutex<BTreeMap<u16, u64>>,
+    reception: receive::Reception,
 }
 
 #[derive(Debug, Default)]
@@ -369,6 +400,7 @@ impl Station {
             bus: BusHealth::default(),
             turned,
             refusals: Mutex::default(),
+            reception: receive::Reception::open(&config.data_dir, config.keyring())?,
         })
     }
 
