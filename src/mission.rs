@@ -485,13 +485,13 @@ fn build(raw: RawMission, path: &Path) -> Result<Mission, MissionError> {
             path: path.to_owned(),
             problems,
         })?;
-    let mavlink_signing =
-        raw.mavlink
-            .signing(&beside)
-            .map_err(|problem| MissionError::Values {
-                path: path.to_owned(),
-                problems: vec![problem],
-            })?;
+    let mavlink_signing = raw
+        .mavlink
+        .signing(&beside)
+        .map_err(|problem| MissionError::Values {
+            path: path.to_owned(),
+            problems: vec![problem],
+        })?;
     let state_dir = raw
         .state
         .dir

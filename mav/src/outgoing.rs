@@ -4,12 +4,12 @@
 //! what one side writes is what the other side reads. Values beyond a field's range saturate;
 //! `None` is written the way each field spells "unknown".
 
+use crate::signing::Signer;
 use crate::telemetry::{
     AttitudeSample, CameraTrackingGeoStatus, CommandAck, CommandInt, CommandLong, CommandResult,
     EstimatorStatus, GlobalPosition, GnssFix, GnssPlace, GpsRaw, Heartbeat, HomePosition, Severity,
     StatusText, SystemTime, TimeSyncMessage, VehicleTime,
 };
-use crate::signing::Signer;
 use crate::wire::Address;
 use emberfix_frames::{BootTime, ServiceTime};
 use mavlink::dialects::development as dialect;

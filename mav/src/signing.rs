@@ -422,12 +422,19 @@ mod tests {
     #[test]
     fn only_allowed_messages_pass_unsigned() {
         let mut guard = guard_at(at_s(0.0));
-        let frame = |message| RawFrame::at_start(&Encoder::new(PEER).encode(&message)).unwrap().0;
+        let frame = |message| {
+            RawFrame::at_start(&Encoder::new(PEER).encode(&message))
+                .unwrap()
+                .0
+        };
         let heartbeat = frame(companion_heartbeat(true));
         assert_eq!(guard.judge(&heartbeat), Judgement::AllowedUnsigned);
         let order = frame(request_message(Address::new(1, 191), 1));
         assert_eq!(guard.judge(&order), refused(Refusal::Unsigned));
-        assert_eq!((guard.counters().refused(), guard.counters().unsigned), (1, 1));
+        assert_eq!(
+            (guard.counters().refused(), guard.counters().unsigned),
+            (1, 1)
+        );
     }
 
     #[test]
@@ -457,7 +464,10 @@ mod tests {
     fn an_unset_clock_takes_the_time_of_the_vehicle() {
         let mut guard = guard_at(ServiceTime::from_unix_ns(0));
         assert_eq!(guard.judge(&signed(at_s(0.0))), Judgement::Signed);
-        assert_eq!(guard.judge(&signed_by(KEY, 1, at_s(-120.0))), refused(Refusal::Old));
+        assert_eq!(
+            guard.judge(&signed_by(KEY, 1, at_s(-120.0))),
+            refused(Refusal::Old)
+        );
         guard.note_time(at_s(1.0));
         assert_eq!(guard.judge(&signed(at_s(600.0))), refused(Refusal::Future));
     }
@@ -465,10 +475,16 @@ mod tests {
     #[test]
     fn a_peer_from_the_future_is_quarantined_alone() {
         let mut guard = guard_at(at_s(0.0));
-        assert_eq!(guard.judge(&signed_by(KEY, 3, at_s(86_400.0))), refused(Refusal::Future));
+        assert_eq!(
+            guard.judge(&signed_by(KEY, 3, at_s(86_400.0))),
+            refused(Refusal::Future)
+        );
         assert_eq!(guard.judge(&signed(at_s(0.5))), Judgement::Signed);
         guard.note_time(at_s(86_400.0));
-        assert_eq!(guard.judge(&signed_by(KEY, 3, at_s(86_401.0))), Judgement::Signed);
+        assert_eq!(
+            guard.judge(&signed_by(KEY, 3, at_s(86_401.0))),
+            Judgement::Signed
+        );
     }
 
     #[test]
@@ -494,7 +510,10 @@ mod tests {
 
     #[test]
     fn a_key_is_64_hexadecimal_digits() {
-        assert_eq!(SigningKey::from_hex(&format!(" {} \n", "07".repeat(32))), Some(KEY));
+        assert_eq!(
+            SigningKey::from_hex(&format!(" {} \n", "07".repeat(32))),
+            Some(KEY)
+        );
         for wrong in ["", "07", &"0g".repeat(32), &"é".repeat(32)] {
             assert_eq!(SigningKey::from_hex(wrong), None);
         }

@@ -25,6 +25,10 @@ pub fn keys(arguments: KeysArguments) -> Result<(), Failure> {
     let key = SecretKey::load_or_make(&mission.key_file()).map_err(Failure::refused)?;
     eprintln!("secret key: {}", mission.key_file().display());
     eprintln!("for the ground configuration, into the [[uav]] table of this aircraft:");
-    println!("name = \"{}\"\npublic_key = \"{}\"", mission.uav, key.public());
+    println!(
+        "name = \"{}\"\npublic_key = \"{}\"",
+        mission.uav,
+        key.public()
+    );
     Ok(())
 }

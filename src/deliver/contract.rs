@@ -111,9 +111,16 @@ fn one_refused_delays_no_other_by_a_second(bench: &mut dyn Bench) {
     let mut waiting: Vec<Letter> = (1..=3).map(|number| letter(number, 1)).collect();
     let settled = run(bench, &mut waiting, 100);
     assert_eq!(delivered(&settled).len(), 2, "{settled:?}");
-    assert!(settled.iter().any(|s| matches!(s, Settled::Refused { id, .. } if id == "uav-1-1")));
+    assert!(
+        settled
+            .iter()
+            .any(|s| matches!(s, Settled::Refused { id, .. } if id == "uav-1-1"))
+    );
     waiting.push(letter(4, 1));
-    assert_eq!(delivered(&run(bench, &mut waiting, 100)), [("uav-1-4".to_owned(), 1)]);
+    assert_eq!(
+        delivered(&run(bench, &mut waiting, 100)),
+        [("uav-1-4".to_owned(), 1)]
+    );
     assert_eq!(waiting.len(), 1);
 }
 
@@ -125,7 +132,14 @@ fn a_newer_revision_is_not_settled_by_an_older_one(bench: &mut dyn Bench) {
     let settled = run(bench, &mut waiting, 300);
     assert_eq!(delivered(&settled).last(), Some(&("uav-1-1".to_owned(), 2)));
     assert!(waiting.is_empty());
-    assert!(bench.other().lock().unwrap().held.contains(&("uav-1-1".to_owned(), 2)));
+    assert!(
+        bench
+            .other()
+            .lock()
+            .unwrap()
+            .held
+            .contains(&("uav-1-1".to_owned(), 2))
+    );
 }
 
 fn what_waits_no_more_is_sent_no_more(bench: &mut dyn Bench) {

@@ -205,7 +205,9 @@ impl<'a> Reader<'a> {
 
     pub fn text(&mut self, longest: usize) -> Option<String> {
         let length = usize::from(self.u8()?);
-        let bytes = self.take(length).filter(|_| (1..=longest).contains(&length))?;
+        let bytes = self
+            .take(length)
+            .filter(|_| (1..=longest).contains(&length))?;
         String::from_utf8(bytes.to_vec()).ok()
     }
 
@@ -243,7 +245,10 @@ mod tests {
         for given in [None, Some(signature)] {
             let header = envelope().http_header(given.as_ref());
             let sealed = Sealed::from_http(&header, &envelope().alarm).unwrap();
-            assert_eq!((sealed.envelope.clone(), sealed.signature), (envelope(), given));
+            assert_eq!(
+                (sealed.envelope.clone(), sealed.signature),
+                (envelope(), given)
+            );
             assert_eq!(sealed.is_signed_by(&key.public()), given.is_some());
         }
     }
@@ -251,9 +256,9 @@ mod tests {
     #[test]
     fn whatever_is_changed_breaks_the_signature() {
         let key = SecretKey::random();
-        let sealed = |envelope: Envelope| Sealed {
-            envelope,
-            signature: Some(super::tests::envelope().sign(&key)),
+        let sealed = |changed: Envelope| Sealed {
+            envelope: changed,
+            signature: Some(envelope().sign(&key)),
         };
         assert!(sealed(envelope()).is_signed_by(&key.public()));
         let change: [fn(&mut Envelope); 5] = [

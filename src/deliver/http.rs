@@ -11,9 +11,9 @@ use super::datagram::wire::{ToAircraft, ToGround, Verdict};
 use super::keys::{PublicKey, SecretKey};
 use super::{Letter, Receipt, Settled, envelope};
 use crate::alarm::Alarm;
+use crate::ground::Ping;
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD as BASE64;
-use crate::ground::Ping;
 use emberfix_frames::ServiceTime;
 use serde::Deserialize;
 use std::time::Duration;
@@ -200,7 +200,9 @@ impl HttpLink {
     #[must_use]
     pub fn place(&self) -> String {
         let place = self.base_url.trim_start_matches("http://");
-        let has_port = place.rfind(':').is_some_and(|at| !place[at..].contains(']'));
+        let has_port = place
+            .rfind(':')
+            .is_some_and(|at| !place[at..].contains(']'));
         if has_port {
             place.to_owned()
         } else {
@@ -295,8 +297,7 @@ impl HttpLink {
         let status = check_status(&url, &mut answer)?.as_u16();
         let bytes = read_bytes(&mut answer).unwrap_or_default();
         let no_receipt = |url| HttpError::NoReceipt { url, status };
-        let (answer, signed) =
-            ToAircraft::read(&bytes).map_err(|_| no_receipt(url.clone()))?;
+        let (answer, signed) = ToAircraft::read(&bytes).map_err(|_| no_receipt(url.clone()))?;
         if self.ground.is_some_and(|key| !signed.is_by(&key)) {
             return Err(HttpError::Forged { url });
         }
@@ -513,8 +514,13 @@ mod tests {
     fn a_receipt_that_the_ground_did_not_sign_is_none() {
         let good = r#"201 Created|{"id":"uav-1-1","revision":1,"stored":true}"#;
         let key = SecretKey::random().public();
-        let refused = answering(good).trusting(Some(key)).send_letter(&letter(1, 1));
-        assert!(matches!(refused, Err(HttpError::Forged { .. })), "{refused:?}");
+        let refused = answering(good)
+            .trusting(Some(key))
+            .send_letter(&letter(1, 1));
+        assert!(
+            matches!(refused, Err(HttpError::Forged { .. })),
+            "{refused:?}"
+        );
     }
 
     #[test]

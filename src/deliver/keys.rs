@@ -46,7 +46,9 @@ pub enum KeyError {
         mode: u32,
     },
     /// The text is no public key.
-    #[error("public key {text:?} is not {PUBLIC_PREFIX}BASE64 of 32 bytes that are a point of the curve")]
+    #[error(
+        "public key {text:?} is not {PUBLIC_PREFIX}BASE64 of 32 bytes that are a point of the curve"
+    )]
     Public {
         /// What was given.
         text: String,
@@ -94,7 +96,11 @@ impl SecretKey {
             path: path.to_owned(),
             source,
         };
-        let mode = std::fs::metadata(path).map_err(failed)?.permissions().mode() & 0o777;
+        let mode = std::fs::metadata(path)
+            .map_err(failed)?
+            .permissions()
+            .mode()
+            & 0o777;
         if mode & 0o077 != 0 {
             return Err(KeyError::Open {
                 path: path.to_owned(),
@@ -115,10 +121,14 @@ impl SecretKey {
             let mut options = std::fs::OpenOptions::new();
             options.write(true).create(true).truncate(true).mode(0o600);
             let mut file = options.open(&beside)?;
-            file.write_all(format!("{SECRET_PREFIX}{}\n", BASE64.encode(self.0.to_bytes())).as_bytes())?;
+            file.write_all(
+                format!("{SECRET_PREFIX}{}\n", BASE64.encode(self.0.to_bytes())).as_bytes(),
+            )?;
             file.sync_all()?;
             std::fs::rename(&beside, path)?;
-            let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
+            let folder = path
+                .parent()
+                .filter(|folder| !folder.as_os_str().is_empty());
             std::fs::File::open(folder.unwrap_or(Path::new(".")))?.sync_all()
         };
         write().map_err(|source| KeyError::Io {
@@ -214,10 +224,19 @@ mod tests {
         let path = folder.path().join("uav.key");
         std::fs::write(&path, "emberfix-secret-1:AAAA\n").unwrap();
         std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o644)).unwrap();
-        assert!(matches!(SecretKey::load_or_make(&path), Err(KeyError::Open { mode: 0o644, .. })));
+        assert!(matches!(
+            SecretKey::load_or_make(&path),
+            Err(KeyError::Open { mode: 0o644, .. })
+        ));
         std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o600)).unwrap();
-        assert!(matches!(SecretKey::load_or_make(&path), Err(KeyError::Secret { .. })));
-        assert_eq!(std::fs::read_to_string(&path).unwrap(), "emberfix-secret-1:AAAA\n");
+        assert!(matches!(
+            SecretKey::load_or_make(&path),
+            Err(KeyError::Secret { .. })
+        ));
+        assert_eq!(
+            std::fs::read_to_string(&path).unwrap(),
+            "emberfix-secret-1:AAAA\n"
+        );
     }
 
     /// RFC 8032, section 7.1, test 2.

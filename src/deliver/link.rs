@@ -267,7 +267,10 @@ mod tests {
         assert_eq!(chosen(&mut courier, &pending, at_ms(0)).unwrap(), "uav-1-1");
         courier.settle(&sent(&pending[0]), &unreachable(), at_ms(10));
         assert_eq!(chosen(&mut courier, &pending, at_ms(400)), None);
-        assert_eq!(chosen(&mut courier, &pending, at_ms(600)).unwrap(), "uav-1-1");
+        assert_eq!(
+            chosen(&mut courier, &pending, at_ms(600)).unwrap(),
+            "uav-1-1"
+        );
         assert_eq!(chosen(&mut courier, &pending, at_ms(601)), None);
         let delivered = Settled::Delivered(sent(&pending[0]));
         courier.settle(&sent(&pending[0]), &delivered, at_ms(700));
@@ -307,14 +310,25 @@ mod tests {
         assert_eq!(lanes.len(), Courier::LANES);
         // The last one gets through, the others time out.
         let (through, hung) = (&pending[7], &pending[..7]);
-        courier.settle(&sent(through), &Settled::Delivered(sent(through)), at_ms(50));
+        courier.settle(
+            &sent(through),
+            &Settled::Delivered(sent(through)),
+            at_ms(50),
+        );
         for letter in hung {
             courier.settle(&sent(letter), &unreachable(), at_ms(5_000));
         }
-        let rest: Vec<Letter> = pending.iter().filter(|l| l.id() != through.id()).cloned().collect();
+        let rest: Vec<Letter> = pending
+            .iter()
+            .filter(|l| l.id() != through.id())
+            .cloned()
+            .collect();
         let again: Vec<String> =
             std::iter::from_fn(|| chosen(&mut courier, &rest, at_ms(7_000))).collect();
-        let sick = again.iter().filter(|id| hung.iter().any(|l| l.id() == *id)).count();
+        let sick = again
+            .iter()
+            .filter(|id| hung.iter().any(|l| l.id() == *id))
+            .count();
         assert_eq!((again.len(), sick), (Courier::LANES, 1));
     }
 }

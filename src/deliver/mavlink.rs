@@ -346,9 +346,8 @@ impl MavlinkDelivery {
     /// What waits no more was delivered another way, or is not owed.
     fn forget_all_but(&mut self, waiting: &[Letter]) {
         let waits = |id: &str| waiting.iter().any(|letter| letter.id() == id);
-        self.fires.retain(|_, telling| {
-            telling.is_delivered() || waits(&telling.alarm.properties.id)
-        });
+        self.fires
+            .retain(|_, telling| telling.is_delivered() || waits(&telling.alarm.properties.id));
     }
 
     /// What comes next, if it is due; in the order of the room's doc.
@@ -848,7 +847,12 @@ mod tests {
             .map(|(at_s, ..)| *at_s)
             .collect();
         assert_eq!(times, [0.0, 1.0, 3.0, 7.0, 15.0, 31.0, 61.0, 91.0]);
-        let receipt = observe(&mut delivery, GROUND, &ack(7, 1, CommandResult::Accepted), after_s(100.0));
+        let receipt = observe(
+            &mut delivery,
+            GROUND,
+            &ack(7, 1, CommandResult::Accepted),
+            after_s(100.0),
+        );
         assert_eq!(
             receipt,
             Some(Receipt {
@@ -865,7 +869,12 @@ mod tests {
         let mut delivery = delivery();
         delivery.offer(&alarm(7, 1)).unwrap();
         run(&mut delivery, 0.0, 0.01);
-        observe(&mut delivery, GROUND, &ack(7, 1, CommandResult::Accepted), after_s(0.02));
+        observe(
+            &mut delivery,
+            GROUND,
+            &ack(7, 1, CommandResult::Accepted),
+            after_s(0.02),
+        );
         assert_eq!(texts(&run(&mut delivery, 0.02, 10.0)).len(), 1);
     }
 
@@ -916,12 +925,22 @@ mod tests {
         delivery.offer(&alarm(2, 1)).unwrap();
         run(&mut delivery, 0.0, 0.6);
         assert_eq!(
-            observe(&mut delivery, GROUND, &ack(1, 1, CommandResult::Denied), after_s(0.7)),
+            observe(
+                &mut delivery,
+                GROUND,
+                &ack(1, 1, CommandResult::Denied),
+                after_s(0.7)
+            ),
             None
         );
         assert!(
-            observe(&mut delivery, GROUND, &ack(2, 1, CommandResult::Accepted), after_s(0.7))
-                .is_some()
+            observe(
+                &mut delivery,
+                GROUND,
+                &ack(2, 1, CommandResult::Accepted),
+                after_s(0.7)
+            )
+            .is_some()
         );
         assert_eq!((delivery.waiting(), delivery.counters().refused), (1, 1));
         let again = commands(&run(&mut delivery, 0.7, 100.0));
@@ -971,13 +990,23 @@ mod tests {
         delivery.offer(&alarm(7, 1)).unwrap();
         run(&mut delivery, 0.0, 0.5);
         delivery.offer(&alarm(7, 2)).unwrap();
-        let late = observe(&mut delivery, GROUND, &ack(7, 1, CommandResult::Accepted), after_s(0.6));
+        let late = observe(
+            &mut delivery,
+            GROUND,
+            &ack(7, 1, CommandResult::Accepted),
+            after_s(0.6),
+        );
         assert_eq!((late, delivery.counters().stray_answers), (None, 1));
         assert_eq!(
             commands(&run(&mut delivery, 0.6, 2.0)),
             [(1.0, FireId(7), 2)]
         );
-        let receipt = observe(&mut delivery, GROUND, &ack(7, 2, CommandResult::Accepted), after_s(2.0));
+        let receipt = observe(
+            &mut delivery,
+            GROUND,
+            &ack(7, 2, CommandResult::Accepted),
+            after_s(2.0),
+        );
         assert_eq!(receipt.map(|receipt| receipt.revision), Some(2));
     }
 
@@ -987,7 +1016,12 @@ mod tests {
         delivery.offer(&alarm(7, 1)).unwrap();
         run(&mut delivery, 0.0, 0.5);
         let accepted = ack(7, 1, CommandResult::Accepted);
-        let stranger = observe(&mut delivery, Address::new(255, 190), &accepted, after_s(0.6));
+        let stranger = observe(
+            &mut delivery,
+            Address::new(255, 190),
+            &accepted,
+            after_s(0.6),
+        );
         assert_eq!((stranger, delivery.waiting()), (None, 1));
     }
 
@@ -1012,7 +1046,8 @@ mod tests {
         delivery.offer(&alarm(2, 1)).unwrap();
         for number in [1, 2] {
             run(&mut delivery, f64::from(number), f64::from(number) + 1.0);
-            observe(&mut delivery, 
+            observe(
+                &mut delivery,
                 GROUND,
                 &ack(number, 1, CommandResult::Accepted),
                 after_s(f64::from(number) + 1.0),
@@ -1036,7 +1071,12 @@ mod tests {
         let mut delivery = delivery();
         delivery.offer(&alarm(7, 1)).unwrap();
         run(&mut delivery, 0.0, 10.0);
-        observe(&mut delivery, GROUND, &ack(7, 1, CommandResult::Accepted), after_s(10.0));
+        observe(
+            &mut delivery,
+            GROUND,
+            &ack(7, 1, CommandResult::Accepted),
+            after_s(10.0),
+        );
         let mut out = alarm(7, 2);
         out.properties.state = FireState::Out;
         delivery.offer(&out).unwrap();
@@ -1082,7 +1122,8 @@ mod tests {
             })
         );
         let first = commands(&run(&mut delivery, 0.0, 0.5))[0].1;
-        observe(&mut delivery, 
+        observe(
+            &mut delivery,
             GROUND,
             &ack(first.0, 1, CommandResult::Accepted),
             after_s(0.6),

@@ -24,7 +24,9 @@ pub fn encode(action: &Action, companion: Address, now: ServiceTime) -> Option<C
     let number = u32::try_from(action.number)
         .ok()
         .filter(|number| *number <= GREATEST_NUMBER)?;
-    let kind = ActionKind::ALL.iter().position(|kind| *kind == action.kind)?;
+    let kind = ActionKind::ALL
+        .iter()
+        .position(|kind| *kind == action.kind)?;
     let age_s = (now - action.at).as_secs_f64().max(0.0);
     Some(CommandLong {
         command: command::USER_2,

@@ -189,7 +189,11 @@ impl Ledger {
         lock(&self.accounts).clone()
     }
 
-    async fn hand_in(&self, entry: Entry, done: oneshot::Receiver<bool>) -> Result<(), LedgerError> {
+    async fn hand_in(
+        &self,
+        entry: Entry,
+        done: oneshot::Receiver<bool>,
+    ) -> Result<(), LedgerError> {
         let sender = self.sender.clone();
         // A full queue blocks, and must not block the runtime.
         let handed = match sender.try_send(entry) {
@@ -227,8 +231,7 @@ fn prepare(database: &mut Connection) -> rusqlite::Result<i64> {
 }
 
 fn read(database: &Connection) -> rusqlite::Result<BTreeMap<Origin, Account>> {
-    let mut statement =
-        database.prepare("SELECT uav, outbox, newest, counted FROM accounts")?;
+    let mut statement = database.prepare("SELECT uav, outbox, newest, counted FROM accounts")?;
     let rows = statement.query_map([], |row| {
         let origin = Origin {
             uav: row.get(0)?,
@@ -371,7 +374,10 @@ mod tests {
         ledger.enter(&envelope(4, 3), "uav-1-1", NOW).await.unwrap();
         assert_eq!(missing(), 1);
         ledger.enter(&envelope(3, 1), "uav-1-2", NOW).await.unwrap();
-        assert_eq!((missing(), ledger.accounts()[&origin()].missing_since), (0, None));
+        assert_eq!(
+            (missing(), ledger.accounts()[&origin()].missing_since),
+            (0, None)
+        );
     }
 
     #[tokio::test]

@@ -21,22 +21,20 @@ use super::tracks::Source;
 use super::{Ping, ReceiveError, Station, lock, now};
 use crate::alarm::{Action, Alarm, FireId};
 use crate::deliver::default_uav;
-use crate::deliver::signing_file::{SigningFile, SigningFileError};
 use crate::deliver::link::pause_after;
 use crate::deliver::orders;
+use crate::deliver::signing_file::{SigningFile, SigningFileError};
 use crate::deliver::spatial::{self, SpatialError};
 use emberfix_frames::{Geoid, ServiceTime};
-use std::collections::BTreeMap;
+use emberfix_mav::Judgement;
 use emberfix_mav::outgoing::{self, command, companion_heartbeat};
-use emberfix_mav::telemetry::{
-    CommandAck, CommandInt, CommandLong, CommandResult, GlobalPosition,
-};
+use emberfix_mav::signing::{SigningCounters, USUAL_UNSIGNED};
+use emberfix_mav::telemetry::{CommandAck, CommandInt, CommandLong, CommandResult, GlobalPosition};
 use emberfix_mav::{
     Address, Chunk, ComponentId, Encoder, Inbox, Link, LinkError, MavMessage, SystemId, Telemetry,
 };
-use emberfix_mav::signing::{SigningCounters, USUAL_UNSIGNED};
-use emberfix_mav::Judgement;
 use serde::Serialize;
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
@@ -158,7 +156,10 @@ impl Agent {
             if sender.system == self.encoder.sender().system {
                 continue; // our own voice, sent back by a router
             }
-            let judgement = self.signing.as_mut().map(|file| file.judge(&received.frame));
+            let judgement = self
+                .signing
+                .as_mut()
+                .map(|file| file.judge(&received.frame));
             if matches!(judgement, Some(Judgement::Refused(_))) {
                 continue;
             }

@@ -46,7 +46,9 @@ pub enum TrustError {
         uav: String,
     },
     /// Not configured, while others are.
-    #[error("{uav} is not in the ground configuration: add [[uav]] name = {uav:?} with its public_key")]
+    #[error(
+        "{uav} is not in the ground configuration: add [[uav]] name = {uav:?} with its public_key"
+    )]
     Stranger {
         /// Who it says it is.
         uav: String,
@@ -88,7 +90,11 @@ impl Keyring {
     ///
     /// # Errors
     /// [`TrustError`].
-    pub fn check(&self, uav: &str, signed_by: impl Fn(&PublicKey) -> bool) -> Result<(), TrustError> {
+    pub fn check(
+        &self,
+        uav: &str,
+        signed_by: impl Fn(&PublicKey) -> bool,
+    ) -> Result<(), TrustError> {
         let uav = || uav.to_owned();
         match self.known.get(&uav()) {
             Some(Some(key)) if signed_by(key) => Ok(()),
@@ -263,7 +269,9 @@ impl Reception {
     pub fn actions_known(&self, uav: &str) -> u64 {
         let accounts = self.ledger.accounts();
         let of = accounts.iter().filter(|(origin, _)| origin.uav == uav);
-        of.map(|(_, account)| account.actions_known).max().unwrap_or(0)
+        of.map(|(_, account)| account.actions_known)
+            .max()
+            .unwrap_or(0)
     }
 
     /// A datagram was dropped unread: too many were under way.
@@ -445,7 +453,10 @@ impl Reception {
         if !own || part.whole == 0 || part.whole as usize > LARGEST_CHIP {
             return None;
         }
-        let mut half_chips = self.half_chips.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut half_chips = self
+            .half_chips
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner);
         let same = |half: &HalfChip| {
             half.origin == part.origin
                 && half.id == part.id
@@ -487,7 +498,9 @@ impl Reception {
 
     fn counted<T, E: Refused>(&self, outcome: Result<T, E>) -> Result<T, E> {
         if let Err(error) = &outcome {
-            error.counter(&self.counters).fetch_add(1, Ordering::Relaxed);
+            error
+                .counter(&self.counters)
+                .fetch_add(1, Ordering::Relaxed);
         }
         outcome
     }
@@ -517,7 +530,9 @@ impl Refused for EnvelopeError {
 fn fitting(actions: Vec<Action>, room: usize) -> Vec<u8> {
     let mut json = b"[]".to_vec();
     for count in 1..=actions.len() {
-        let longer = serde_json::json!(&actions[..count]).to_string().into_bytes();
+        let longer = serde_json::json!(&actions[..count])
+            .to_string()
+            .into_bytes();
         if longer.len() > room {
             break;
         }

@@ -7,8 +7,8 @@
 use super::core::Input;
 use super::{Board, SharedOutbox, lock};
 use crate::alarm::Action;
-use crate::deliver::datagram::wire::{Ask, RECEIVE_BUFFER, ToAircraft, ToGround};
 use crate::deliver::datagram::News;
+use crate::deliver::datagram::wire::{Ask, RECEIVE_BUFFER, ToAircraft, ToGround};
 use crate::deliver::envelope::Origin;
 use crate::deliver::http::{HttpError, HttpLink};
 use crate::deliver::keys::SecretKey;
@@ -88,9 +88,7 @@ impl IpCourier {
             place: link.place(),
             socket: None,
             looked_up: None,
-            datagrams: ground
-                .datagrams
-                .then(|| DatagramDelivery::new(settings)),
+            datagrams: ground.datagrams.then(|| DatagramDelivery::new(settings)),
             http: HttpLanes::new(link),
             key,
             origin,
@@ -311,13 +309,20 @@ impl IpCourier {
     /// Once per outage.
     fn complain(&mut self, reason: &str) {
         if !std::mem::replace(&mut self.complained, true) {
-            tracing::warn!(reason, "ground station not reached; alarms wait in the outbox");
+            tracing::warn!(
+                reason,
+                "ground station not reached; alarms wait in the outbox"
+            );
         }
     }
 }
 
 /// On disk first; only then does the pipeline hear of it.
-pub(super) fn keep_action(outbox: &SharedOutbox, events: Option<&SyncSender<Input>>, action: Action) -> bool {
+pub(super) fn keep_action(
+    outbox: &SharedOutbox,
+    events: Option<&SyncSender<Input>>,
+    action: Action,
+) -> bool {
     match lock(outbox).take_action(&action) {
         Ok(true) => {
             tracing::info!(?action, "an operator acted");

@@ -20,8 +20,8 @@ mod telemetry;
 
 pub(crate) use telemetry::WANTED;
 
-use crate::deliver::mavlink::MavlinkDelivery;
 use crate::deliver::keys::{KeyError, SecretKey};
+use crate::deliver::mavlink::MavlinkDelivery;
 use crate::deliver::signing_file::{SigningFile, SigningFileError};
 use crate::deliver::{DatagramDelivery, Outbox, OutboxError, Owner};
 use crate::ground::Ping;

@@ -2,8 +2,8 @@
 //! they come, keeps time, hands frames to the pipeline, sends alarms.
 
 use super::core::Input;
-use super::{Board, SharedOutbox, lock};
 use super::courier::keep_action;
+use super::{Board, SharedOutbox, lock};
 use crate::deliver::mavlink::{MavlinkDelivery, MavlinkSettings};
 use crate::deliver::signing_file::SigningFile;
 use crate::deliver::{AlarmLink, Receipt, Settled, orders};
@@ -16,8 +16,8 @@ use emberfix_mav::outgoing::{
 use emberfix_mav::signing::SIGNATURE_LEN;
 use emberfix_mav::telemetry::{CommandAck, CommandResult, Severity, StatusText};
 use emberfix_mav::{
-    Address, Chunk, ComponentId, Encoder, FrameReader, Judgement, Link, MavMessage, Peer, Received, SystemId,
-    Telemetry, message_name,
+    Address, Chunk, ComponentId, Encoder, FrameReader, Judgement, Link, MavMessage, Peer, Received,
+    SystemId, Telemetry, message_name,
 };
 use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::sync::Arc;
@@ -132,7 +132,10 @@ impl Talk {
             frames.push(received);
         }
         for received in frames {
-            let judgement = self.signing.as_mut().map(|file| file.judge(&received.frame));
+            let judgement = self
+                .signing
+                .as_mut()
+                .map(|file| file.judge(&received.frame));
             if matches!(judgement, Some(Judgement::Refused(_))) {
                 continue;
             }
@@ -242,7 +245,10 @@ impl Talk {
                 system,
                 component: ComponentId::ONBOARD_COMPUTER,
             };
-            let signer = self.signing.as_ref().map(|file| file.signer(0, (self.clock)()));
+            let signer = self
+                .signing
+                .as_ref()
+                .map(|file| file.signer(0, (self.clock)()));
             let signature_bytes = if signer.is_some() { SIGNATURE_LEN } else { 0 };
             self.encoder = Some(Encoder::new(own).signing(signer));
             self.delivery = Some(MavlinkDelivery::new(MavlinkSettings {

@@ -118,7 +118,9 @@ pub struct DatagramDelivery {
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum LinkState {
     Down,
-    Up { unanswered_since: Option<ServiceTime> },
+    Up {
+        unanswered_since: Option<ServiceTime>,
+    },
 }
 
 #[derive(Debug)]

@@ -113,7 +113,10 @@ impl Pace {
 
     /// An answer came: is there a queue?
     pub fn note(&mut self, round_trip: &RoundTrip, now: ServiceTime) {
-        if self.changed_at.is_some_and(|changed| now - changed < STEADY) {
+        if self
+            .changed_at
+            .is_some_and(|changed| now - changed < STEADY)
+        {
             return;
         }
         self.changed_at = Some(now);

@@ -149,7 +149,10 @@ fn an_alarm_through_a_lossy_way_takes_a_retry_or_two() {
     let took = latencies(0.3, 4_000);
     let (p50, p99) = (took[took.len() / 2], took[took.len() * 99 / 100]);
     // Twice 40 ms is the floor; a stream's p99 is beyond 1.4 s here.
-    assert!(p50 <= 65 && p99 <= 2 * ONE_WAY_MS + 250, "p50 {p50} ms, p99 {p99} ms");
+    assert!(
+        p50 <= 65 && p99 <= 2 * ONE_WAY_MS + 250,
+        "p50 {p50} ms, p99 {p99} ms"
+    );
     assert_eq!(latencies(0.0, 200).last(), Some(&ONE_WAY_MS));
 }
 
@@ -163,7 +166,10 @@ fn after_ten_minutes_of_silence_everything_goes_within_a_second() {
     }
     assert_eq!(waiting.len(), 200);
     let quiet_bytes_per_s = way.bytes_up / 600;
-    assert!(quiet_bytes_per_s < 4_000, "{quiet_bytes_per_s} B/s into nothing");
+    assert!(
+        quiet_bytes_per_s < 4_000,
+        "{quiet_bytes_per_s} B/s into nothing"
+    );
     way.cut = false;
     for ms in 600_000..601_000 {
         way.step(&mut waiting, ms);
@@ -225,7 +231,10 @@ fn what_the_ground_did_not_sign_is_not_believed() {
     let stored = receipt(waiting[0].sequence(), 1, Verdict::Stored);
     link.take(&stored.datagram(None), at_ms(50));
     link.take(&stored.datagram(Some(&SecretKey::random())), at_ms(50));
-    assert_eq!((link.work(&waiting, at_ms(51)), link.counters().forged), (vec![], 2));
+    assert_eq!(
+        (link.work(&waiting, at_ms(51)), link.counters().forged),
+        (vec![], 2)
+    );
     link.take(&stored.datagram(Some(&ground)), at_ms(52));
     assert_eq!(link.work(&waiting, at_ms(53)).len(), 1);
 }
@@ -246,7 +255,10 @@ fn answers_to_others_or_from_before_are_stray() {
     link.take(&answer(7, 1).datagram(None), at_ms(1));
     link.take(b"EF\x01", at_ms(1));
     let counters = link.counters();
-    assert_eq!((counters.stray, counters.unreadable, link.is_up()), (2, 1, false));
+    assert_eq!(
+        (counters.stray, counters.unreadable, link.is_up()),
+        (2, 1, false)
+    );
 }
 
 #[test]
@@ -259,7 +271,11 @@ fn a_letter_that_the_ground_refuses_is_tried_ever_more_rarely() {
         while let Some(datagram) = link.poll(at_ms(ms)) {
             if let (ToGround::Letter { attempt, .. }, _) = ToGround::read(&datagram).unwrap() {
                 sent_ms.push(ms);
-                let refused = receipt(waiting[0].sequence(), attempt, Verdict::Refused("no".into()));
+                let refused = receipt(
+                    waiting[0].sequence(),
+                    attempt,
+                    Verdict::Refused("no".into()),
+                );
                 link.take(&refused.datagram(None), at_ms(ms));
             }
         }

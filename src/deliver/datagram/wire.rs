@@ -658,8 +658,8 @@ mod tests {
             for at in 0..datagram.len() {
                 let mut forged = datagram.clone();
                 forged[at] ^= 0x10;
-                let passes = ToAircraft::read(&forged)
-                    .is_ok_and(|(_, signed)| signed.is_by(&key.public()));
+                let passes =
+                    ToAircraft::read(&forged).is_ok_and(|(_, signed)| signed.is_by(&key.public()));
                 assert!(!passes, "byte {at} of {said:?}");
             }
         }
@@ -671,7 +671,8 @@ mod tests {
         let packed = PackedLetter::pack(&sealed(Some(&key))).unwrap();
         let (packed, plain) = (packed.datagram(0).len(), sealed(None).envelope.alarm.len());
         assert!(2 * packed < plain, "{packed} of {plain} bytes");
-        let (read, _) = ToGround::read(&PackedLetter::pack(&sealed(Some(&key))).unwrap().datagram(1)).unwrap();
+        let (read, _) =
+            ToGround::read(&PackedLetter::pack(&sealed(Some(&key))).unwrap().datagram(1)).unwrap();
         let ToGround::Letter { sealed, .. } = read else {
             panic!("{read:?}");
         };

@@ -13,7 +13,9 @@ use super::{Urgency, fire_number};
 use crate::alarm::{Action, Alarm, Attention, FireId};
 use emberfix_frames::ServiceTime;
 use reserve::Reserve;
-use rusqlite::{Connection, ErrorCode, OptionalExtension, Transaction, TransactionBehavior, params};
+use rusqlite::{
+    Connection, ErrorCode, OptionalExtension, Transaction, TransactionBehavior, params,
+};
 use sha2::{Digest as _, Sha256};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -266,7 +268,11 @@ impl Outbox {
                 t.execute(
                     "INSERT INTO actions (alarm, number, kind) VALUES (?1, ?2, ?3)
                      ON CONFLICT (alarm) DO UPDATE SET number = ?2, kind = ?3",
-                    params![action.alarm, number, serde_json::json!(action.kind).as_str()],
+                    params![
+                        action.alarm,
+                        number,
+                        serde_json::json!(action.kind).as_str()
+                    ],
                 )?;
             }
             Ok(newer == 1)
@@ -365,9 +371,8 @@ impl Outbox {
     }
 
     fn pending_sequences(&self, link: &str, limit: usize) -> Result<Vec<i64>, OutboxError> {
-        let select = format!(
-            "SELECT alarms.sequence {WAITING_FOR} ORDER BY urgency, stored LIMIT ?2"
-        );
+        let select =
+            format!("SELECT alarms.sequence {WAITING_FOR} ORDER BY urgency, stored LIMIT ?2");
         let limit = i64::try_from(limit).unwrap_or(i64::MAX);
         let read = || {
             let mut statement = self.database.prepare_cached(&select)?;
@@ -420,8 +425,12 @@ impl Outbox {
     }
 
     fn read_row(&self, sequence: u64, row: Row) -> Option<Letter> {
-        let whole = row.digest.is_none_or(|digest| digest == self::digest(&row.json));
-        let alarm = whole.then(|| Alarm::from_geojson(&row.json).ok()).flatten()?;
+        let whole = row
+            .digest
+            .is_none_or(|digest| digest == self::digest(&row.json));
+        let alarm = whole
+            .then(|| Alarm::from_geojson(&row.json).ok())
+            .flatten()?;
         let envelope = Envelope {
             origin: self.origin(),
             sequence,
@@ -440,11 +449,17 @@ impl Outbox {
     }
 
     fn set_aside(&mut self, sequence: i64) -> Result<(), OutboxError> {
-        tracing::error!(sequence, "AN ALARM IN THE OUTBOX IS DAMAGED and is not sent");
+        tracing::error!(
+            sequence,
+            "AN ALARM IN THE OUTBOX IS DAMAGED and is not sent"
+        );
         self.unreadable += 1;
         self.commit("set an alarm aside", |t| {
-            t.execute("UPDATE alarms SET readable = 0 WHERE sequence = ?1", [sequence])
-                .map(|_| ())
+            t.execute(
+                "UPDATE alarms SET readable = 0 WHERE sequence = ?1",
+                [sequence],
+            )
+            .map(|_| ())
         })
     }
 
@@ -497,9 +512,11 @@ fn prepare(database: &Connection) -> rusqlite::Result<()> {
 }
 
 fn counter(database: &Connection, name: &str) -> rusqlite::Result<i64> {
-    database.query_row("SELECT value FROM counters WHERE name = ?1", [name], |row| {
-        row.get(0)
-    })
+    database.query_row(
+        "SELECT value FROM counters WHERE name = ?1",
+        [name],
+        |row| row.get(0),
+    )
 }
 
 fn attention(database: &Connection) -> rusqlite::Result<BTreeMap<String, Attention>> {

@@ -60,7 +60,9 @@ impl Reserve {
     fn fill(&self) -> std::io::Result<()> {
         let file = std::fs::File::create(&self.path)?;
         let whole = rustix::fs::fallocate(&file, rustix::fs::FallocateFlags::empty(), 0, BYTES);
-        let written = whole.map_err(std::io::Error::from).and_then(|()| file.sync_all());
+        let written = whole
+            .map_err(std::io::Error::from)
+            .and_then(|()| file.sync_all());
         if written.is_err() {
             // What could not be held whole holds nothing.
             let _gone = std::fs::remove_file(&self.path);

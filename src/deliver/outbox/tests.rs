@@ -109,10 +109,7 @@ fn one_unreadable_alarm_does_not_block_the_others() {
         .execute("UPDATE alarms SET json = '{' WHERE id = 'uav-1-1'", [])
         .unwrap();
     assert_eq!(ids(&mut outbox, "ip"), [("uav-1-2".to_owned(), 1)]);
-    assert_eq!(
-        (outbox.unreadable(), outbox.waiting("ip").unwrap()),
-        (1, 1)
-    );
+    assert_eq!((outbox.unreadable(), outbox.waiting("ip").unwrap()), (1, 1));
 }
 
 #[test]
@@ -221,7 +218,8 @@ fn an_older_outbox_is_renewed_and_loses_nothing() {
         )
         .unwrap();
     }
-    old.execute("INSERT INTO receipts VALUES ('http', 'uav-1-3', 2)", []).unwrap();
+    old.execute("INSERT INTO receipts VALUES ('http', 'uav-1-3', 2)", [])
+        .unwrap();
     drop(old);
     let mut outbox = place.open();
     assert_eq!(ids(&mut outbox, "ip"), [("uav-1-5".to_owned(), 2)]);
@@ -250,7 +248,10 @@ fn every_revision_has_a_number_and_says_for_how_many_it_stands() {
     let pending = outbox.pending("ip", 10).unwrap();
     let numbers: Vec<_> = pending.iter().map(numbers).collect();
     assert_eq!(numbers, [(4, 3), (2, 1)]);
-    assert_eq!((outbox.newest_sequence().unwrap(), outbox.origin()), (4, origin));
+    assert_eq!(
+        (outbox.newest_sequence().unwrap(), outbox.origin()),
+        (4, origin)
+    );
 }
 
 #[test]
@@ -275,7 +276,8 @@ fn a_changed_digit_is_set_aside_and_never_signed() {
     let mut outbox = place.open();
     outbox.put(&alarm(1, 1), NOW).unwrap();
     outbox.put(&alarm(2, 1), NOW).unwrap();
-    let moved = "UPDATE alarms SET json = replace(json, '31.409422', '31.409423') WHERE id = 'uav-1-1'";
+    let moved =
+        "UPDATE alarms SET json = replace(json, '31.409422', '31.409423') WHERE id = 'uav-1-1'";
     assert_eq!(outbox.database.execute(moved, []).unwrap(), 1);
     assert_eq!(ids(&mut outbox, "ip"), [("uav-1-2".to_owned(), 1)]);
     assert_eq!(outbox.unreadable(), 1);

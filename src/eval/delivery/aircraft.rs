@@ -76,7 +76,9 @@ pub fn fly(arguments: &AircraftArguments) -> Result<(), DeliveryError> {
         events: None,
     };
     let courier = courier.ok().flatten().ok_or(DeliveryError::Thread)?;
-    let thread = courier.start(around).map_err(super::io("start the courier"))?;
+    let thread = courier
+        .start(around)
+        .map_err(super::io("start the courier"))?;
     say("ready");
     put_until_told(arguments, &outbox)?;
     wait_until_empty(&outbox)?;

@@ -19,10 +19,15 @@ pub(super) fn compare(
     puts: &[Put],
 ) -> Result<Audit, DeliveryError> {
     let (sent, kept) = (outbox_alarms(outbox)?, ground_alarms(ground, uav)?);
-    let mut lost: usize = sent.iter().filter(|(key, at)| kept.get(*key) != Some(at)).count();
+    let mut lost: usize = sent
+        .iter()
+        .filter(|(key, at)| kept.get(*key) != Some(at))
+        .count();
     let newest = newest_revisions(&kept);
     for put in newest_puts(puts).values() {
-        let there = newest.get(&put.id).is_some_and(|revision| *revision >= put.revision);
+        let there = newest
+            .get(&put.id)
+            .is_some_and(|revision| *revision >= put.revision);
         let dated = match kept.get(&(put.id.clone(), put.revision)) {
             Some(at) => *at == [put.captured_ns],
             // Replaced by a newer revision, which is there.
@@ -65,7 +70,12 @@ fn newest_revisions(alarms: &Alarms) -> BTreeMap<String, u32> {
 }
 
 fn outbox_alarms(path: &Path) -> Result<Alarms, DeliveryError> {
-    read(path, "SELECT id, revision, captured_at_ns FROM alarms", &[], |row| row.get(2))
+    read(
+        path,
+        "SELECT id, revision, captured_at_ns FROM alarms",
+        &[],
+        |row| row.get(2),
+    )
 }
 
 fn ground_alarms(path: &Path, uav: &str) -> Result<Alarms, DeliveryError> {
@@ -122,9 +132,9 @@ impl Watch {
     /// Ids and revisions that have come since the last look.
     pub fn look(&mut self) -> Vec<(String, u32)> {
         let look = || {
-            let mut statement = self
-                .database
-                .prepare_cached("SELECT row, id, revision FROM alarms WHERE row > ?1 ORDER BY row")?;
+            let mut statement = self.database.prepare_cached(
+                "SELECT row, id, revision FROM alarms WHERE row > ?1 ORDER BY row",
+            )?;
             let rows = statement.query_map([self.row], |row| {
                 Ok((row.get(0)?, (row.get(1)?, row.get(2)?)))
             })?;
@@ -157,11 +167,15 @@ mod tests {
         let (a, g) = (folder.path().join("a"), folder.path().join("g"));
         let database = Connection::open(&a).unwrap();
         database
-            .execute_batch("CREATE TABLE alarms (id TEXT, revision INTEGER, captured_at_ns INTEGER)")
+            .execute_batch(
+                "CREATE TABLE alarms (id TEXT, revision INTEGER, captured_at_ns INTEGER)",
+            )
             .unwrap();
         for put in outbox {
             let row = (&put.id, put.revision, put.captured_ns);
-            database.execute("INSERT INTO alarms VALUES (?1, ?2, ?3)", row).unwrap();
+            database
+                .execute("INSERT INTO alarms VALUES (?1, ?2, ?3)", row)
+                .unwrap();
         }
         let database = Connection::open(&g).unwrap();
         database
@@ -170,12 +184,17 @@ mod tests {
                  (id TEXT, revision INTEGER, captured_at TEXT, summary INTEGER, uav TEXT)",
             )
             .unwrap();
-        for (put, late) in ground.iter().zip([misdated].into_iter().chain(std::iter::repeat(false)))
+        for (put, late) in ground
+            .iter()
+            .zip([misdated].into_iter().chain(std::iter::repeat(false)))
         {
             let late_ns = if late { 1_000_000_000 } else { 0 };
             let at = ServiceTime::from_unix_ns(put.captured_ns + late_ns).rfc3339();
             database
-                .execute("INSERT INTO alarms VALUES (?1, ?2, ?3, 0, 'u')", (&put.id, put.revision, at))
+                .execute(
+                    "INSERT INTO alarms VALUES (?1, ?2, ?3, 0, 'u')",
+                    (&put.id, put.revision, at),
+                )
                 .unwrap();
         }
         compare(&a, &g, "u", puts).unwrap()
@@ -185,15 +204,29 @@ mod tests {
     fn what_is_missing_twice_misdated_or_made_up_is_found() {
         let whole = [put("u-1", 2), put("u-2", 1)];
         let found = |ground: &[Put], misdated| {
-            let audit = audit(&whole, ground, &[put("u-1", 1), put("u-1", 2), put("u-2", 1)], misdated);
+            let audit = audit(
+                &whole,
+                ground,
+                &[put("u-1", 1), put("u-1", 2), put("u-2", 1)],
+                misdated,
+            );
             (audit.lost > 0, audit.duplicated)
         };
         assert_eq!(found(&whole, false), (false, 0));
-        assert_eq!(found(&[put("u-1", 1), put("u-1", 2), put("u-2", 1)], false), (false, 0));
+        assert_eq!(
+            found(&[put("u-1", 1), put("u-1", 2), put("u-2", 1)], false),
+            (false, 0)
+        );
         assert_eq!(found(&[put("u-1", 1), put("u-2", 1)], false), (true, 0));
         assert_eq!(found(&whole, true), (true, 0));
-        assert_eq!(found(&[put("u-1", 2), put("u-1", 2), put("u-2", 1)], false).1, 1);
-        assert_eq!(found(&[put("u-1", 2), put("u-2", 1), put("u-3", 1)], false).1, 1);
+        assert_eq!(
+            found(&[put("u-1", 2), put("u-1", 2), put("u-2", 1)], false).1,
+            1
+        );
+        assert_eq!(
+            found(&[put("u-1", 2), put("u-2", 1), put("u-3", 1)], false).1,
+            1
+        );
         // Pruned from the outbox, and still owed.
         assert!(audit(&[], &[put("u-1", 1)], &whole, false).lost > 0);
     }

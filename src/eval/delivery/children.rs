@@ -210,7 +210,14 @@ impl Aircraft {
         } = &self.behaviour;
         let mut command = ourselves()?;
         command
-            .args(["eval", "delivery-aircraft", "--uav", uav, "--ground", &self.ground])
+            .args([
+                "eval",
+                "delivery-aircraft",
+                "--uav",
+                uav,
+                "--ground",
+                &self.ground,
+            ])
             .args(["--ground-key", &self.ground_key.to_string()])
             .args(["--every-ms", &every_ms.to_string()])
             .args(["--revisions", &revisions.to_string()])
@@ -254,7 +261,11 @@ impl Aircraft {
     /// What it said that it put, in all its lives, in order.
     pub fn puts(&self) -> Vec<Put> {
         let of = |heard: &Heard| -> Vec<Put> {
-            heard.lines().iter().filter_map(|line| Put::read(line)).collect()
+            heard
+                .lines()
+                .iter()
+                .filter_map(|line| Put::read(line))
+                .collect()
         };
         self.heard.iter().flat_map(of).collect()
     }

@@ -96,10 +96,10 @@ struct Image {
     before: usize,
 }
 
-fn image(folder: &Copies) -> Result<Image, DeliveryError> {
-    let path = folder.0.join("image.sqlite");
+fn image(folder: &Copies, name: &str) -> Result<Image, DeliveryError> {
+    let path = folder.0.join(name);
     let read = |path: &Path| std::fs::read(path).map_err(io("read the outbox's files"));
-    let mut outbox = folder.open("image.sqlite")?;
+    let mut outbox = folder.open(name)?;
     for number in 1..=BEFORE {
         outbox.put(&a_fire("uav-1", number, NOW)?, NOW)?;
     }
@@ -119,7 +119,12 @@ fn reopened(folder: &Copies, database: &[u8], log: &[u8]) -> Option<BTreeSet<Str
     std::fs::write(wal(&path), log).ok()?;
     let mut outbox = folder.open("copy.sqlite").ok()?;
     let pending = outbox.pending(LINK, 100).ok()?;
-    Some(pending.iter().map(|letter| letter.id().to_owned()).collect())
+    Some(
+        pending
+            .iter()
+            .map(|letter| letter.id().to_owned())
+            .collect(),
+    )
 }
 
 fn ids(numbers: std::ops::RangeInclusive<u32>) -> BTreeSet<String> {
@@ -129,7 +134,7 @@ fn ids(numbers: std::ops::RangeInclusive<u32>) -> BTreeSet<String> {
 /// The log is cut at every byte of the last write: all earlier alarms are there, and the last one if
 /// its write is whole.
 fn torn(folder: &Copies, stride: usize) -> Result<Damage, DeliveryError> {
-    let image = image(folder)?;
+    let image = image(folder, "torn.sqlite")?;
     let mut damage = Damage::default();
     let whole = image.log.len();
     let cuts = (image.before..whole).step_by(stride).chain([whole]);
@@ -149,7 +154,7 @@ fn torn(folder: &Copies, stride: usize) -> Result<Damage, DeliveryError> {
 /// One bit of the log is flipped: an alarm may be lost, and then the outbox knows or never had it; a
 /// changed one is never sent.
 fn flipped(folder: &Copies, stride: usize) -> Result<Damage, DeliveryError> {
-    let image = image(folder)?;
+    let image = image(folder, "flipped.sqlite")?;
     let mut damage = Damage::default();
     for at in (0..image.log.len()).step_by(stride) {
         let mut log = image.log.clone();
@@ -210,7 +215,9 @@ impl Drop for SmallDisk {
 fn small_disk(folder: &Path) -> Result<Option<SmallDisk>, DeliveryError> {
     std::fs::create_dir_all(folder).map_err(io("make a folder to mount on"))?;
     let mut mount = std::process::Command::new("mount");
-    mount.args(["-t", "tmpfs", "-o", "size=24m", "tmpfs"]).arg(folder);
+    mount
+        .args(["-t", "tmpfs", "-o", "size=24m", "tmpfs"])
+        .arg(folder);
     let mounted = mount.stderr(std::process::Stdio::null()).status();
     let mounted = mounted.is_ok_and(|status| status.success());
     Ok(mounted.then(|| SmallDisk(folder.to_owned())))
@@ -226,7 +233,8 @@ fn fill(folder: &Path) -> Result<(), DeliveryError> {
 }
 
 fn table(torn: &Damage, flipped: &Damage, full: &Damage) -> Table {
-    let row = |what: &str, cases: usize, then: String| vec![what.to_owned(), cases.to_string(), then];
+    let row =
+        |what: &str, cases: usize, then: String| vec![what.to_owned(), cases.to_string(), then];
     Table {
         title: "What a disk may do".to_owned(),
         header: ["damage", "cases", "outcome"].map(str::to_owned).to_vec(),

@@ -53,13 +53,17 @@ pub(super) fn measure(
         found.figures.push(figure(&case, &measured));
         found.details.insert(
             format!("latency_{}_ms", case.name),
-            [50, 90, 95, 99, 100].map(|p| measured.percentile(p)).to_vec().into(),
+            [50, 90, 95, 99, 100]
+                .map(|p| measured.percentile(p))
+                .to_vec()
+                .into(),
         );
     }
     found.tables.push(Table {
-        title: "Decision to the ground's disk, ms (40 ms each way where it is lossy; TCP's loss is \
+        title:
+            "Decision to the ground's disk, ms (40 ms each way where it is lossy; TCP's loss is \
                 modelled)"
-            .to_owned(),
+                .to_owned(),
         header: ["case", "alarms", "p50", "p90", "p95", "p99", "max"]
             .map(str::to_owned)
             .to_vec(),
@@ -143,7 +147,8 @@ fn run(case: &Case, seed: u64, folder: &Path) -> Result<Measured, DeliveryError>
     let mut aircraft = Aircraft::start(&home, behaviour, proxy.address, ground.key)?;
     let mut came: HashMap<String, i64> = HashMap::new();
     let begun = Instant::now();
-    let flight = Duration::from_millis(case.every_ms) * u32::try_from(case.alarms).unwrap_or(u32::MAX);
+    let flight =
+        Duration::from_millis(case.every_ms) * u32::try_from(case.alarms).unwrap_or(u32::MAX);
     while begun.elapsed() < flight {
         look(&mut watch, &mut came);
     }

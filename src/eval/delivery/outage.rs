@@ -79,7 +79,8 @@ fn there(watch: &mut Watch, mut came: Newest, owed: &Newest) -> (Newest, usize) 
         let known = came.entry(id).or_default();
         *known = (*known).max(revision);
     }
-    let has = |(id, revision): &(&String, &u32)| came.get(*id).is_some_and(|there| there >= *revision);
+    let has =
+        |(id, revision): &(&String, &u32)| came.get(*id).is_some_and(|there| there >= *revision);
     let count = owed.iter().filter(has).count();
     (came, count)
 }

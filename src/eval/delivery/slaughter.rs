@@ -45,7 +45,9 @@ pub(super) fn measure(
     });
     let pairs = pairs.into_iter().collect::<Result<Vec<_>, _>>()?;
     let mut found = outage?;
-    let audit = pairs.iter().fold(Audit::default(), |sum, pair| sum.plus(pair.audit));
+    let audit = pairs
+        .iter()
+        .fold(Audit::default(), |sum, pair| sum.plus(pair.audit));
     found.audit = found.audit.plus(audit);
     let done: usize = pairs.iter().map(|pair| pair.aircraft + pair.ground).sum();
     found.figures.insert(
