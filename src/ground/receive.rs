@@ -355,7 +355,10 @@ impl Reception {
 
     /// Greatest action for an aircraft, as far as its last beat made us look.
     fn newest_action(&self, uav: &str) -> u64 {
-        let newest = self.newest_actions.lock().unwrap_or_else(PoisonError::into_inner);
+        let newest = self
+            .newest_actions
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner);
         newest.get(uav).copied().unwrap_or(0)
     }
 
@@ -368,7 +371,10 @@ impl Reception {
         }
         let news = station.actions_after(uav, known).await;
         let newest = news.last().map_or(known, |action| action.number);
-        let mut all = self.newest_actions.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut all = self
+            .newest_actions
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner);
         all.insert(uav.clone(), newest);
         newest
     }
