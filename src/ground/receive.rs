@@ -237,17 +237,31 @@ impl Reception {
     ) -> Result<(Alarm, Kept, Option<String>), ReceiveError> {
         use base64::Engine as _;
         let Some(header) = header else {
-            let alarm = Alarm::from_geojson(body)?;
-            let uav = alarm.properties.uav.clone();
-            self.counted(self.keyring.check_alarm(&uav, &alarm, |_| false))?;
+            self.check_bare(station, body, link)?;
             let (alarm, kept) = station.receive(body, link, Completeness::Full).await?;
             return Ok((alarm, kept, None));
         };
-        let sealed = self.counted(Sealed::from_http(header, body))?;
+        let sealed = self.counted(Sealed::from_http(header, body));
+        let sealed = sealed.inspect_err(|error| station.refuse(error, link))?;
         let (alarm, kept) = self.keep(station, &sealed, link).await?;
         let receipt = self.receipt(&sealed, 0, Verdict::Stored);
         let receipt = base64::engine::general_purpose::STANDARD.encode(receipt);
         Ok((alarm, kept, Some(receipt)))
+    }
+
+    /// Whether an alarm without an envelope may come in; what is no alarm is refused further on.
+    fn check_bare(
+        &self,
+        station: &Station,
+        body: &[u8],
+        link: &'static str,
+    ) -> Result<(), TrustError> {
+        let Ok(alarm) = Alarm::from_geojson(body) else {
+            return Ok(());
+        };
+        let uav = &alarm.properties.uav;
+        self.counted(self.keyring.check_alarm(uav, &alarm, |_| false))
+            .inspect_err(|error| station.refuse(error, link))
     }
 
     /// What to answer to a datagram; nothing to what is not understood or not believed.

@@ -441,8 +441,7 @@ impl DatagramDelivery {
     }
 
     /// Takes in what waits; what does not wait any more was delivered another way, or replaced.
-    fn offer(&mut self, waiting: &[Letter]) {
-        let wanted: Vec<&Letter> = waiting.iter().take(Self::WINDOW).collect();
+    fn offer(&mut self, wanted: Vec<&Letter>) {
         let sequences: BTreeSet<u64> = wanted.iter().map(|letter| letter.sequence()).collect();
         self.letters
             .retain(|sequence, _| sequences.contains(sequence));
@@ -471,8 +470,16 @@ impl AlarmLink for DatagramDelivery {
     }
 
     fn work(&mut self, waiting: &[Letter], _now: ServiceTime) -> Vec<Settled> {
-        self.offer(waiting);
-        std::mem::take(&mut self.settled)
+        let settled = std::mem::take(&mut self.settled);
+        let delivered = |letter: &&Letter| {
+            settled.iter().any(|settled| {
+                matches!(settled, Settled::Delivered(receipt)
+                    if receipt.id == letter.id() && receipt.revision >= letter.revision())
+            })
+        };
+        let owed = waiting.iter().filter(|letter| !delivered(letter));
+        self.offer(owed.take(Self::WINDOW).collect());
+        settled
     }
 }
 

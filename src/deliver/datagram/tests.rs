@@ -129,8 +129,9 @@ fn latencies(loss: f64, count: u32) -> Vec<i64> {
     let mut way = Way::new(loss);
     let mut waiting = Vec::new();
     let mut told_ms = BTreeMap::new();
-    for ms in 0..i64::from(count) * 50 + 20_000 {
-        if ms % 50 == 0 && ms / 50 < i64::from(count) {
+    // The ground is known to be there before the first alarm.
+    for ms in -1_000..i64::from(count) * 50 + 20_000 {
+        if ms >= 0 && ms % 50 == 0 && ms / 50 < i64::from(count) {
             let letter = letter(u32::try_from(ms / 50 + 1).unwrap(), 1);
             told_ms.insert(letter.sequence(), ms);
             waiting.push(letter);
@@ -269,15 +270,20 @@ fn a_letter_that_the_ground_refuses_is_tried_ever_more_rarely() {
     for ms in 0..20_000 {
         link.work(&waiting, at_ms(ms));
         while let Some(datagram) = link.poll(at_ms(ms)) {
-            if let (ToGround::Letter { attempt, .. }, _) = ToGround::read(&datagram).unwrap() {
-                sent_ms.push(ms);
-                let refused = receipt(
-                    waiting[0].sequence(),
-                    attempt,
-                    Verdict::Refused("no".into()),
-                );
-                link.take(&refused.datagram(None), at_ms(ms));
-            }
+            let answer = match ToGround::read(&datagram).unwrap().0 {
+                ToGround::Letter { attempt, .. } => {
+                    sent_ms.push(ms);
+                    let refused = Verdict::Refused("no".to_owned());
+                    receipt(waiting[0].sequence(), attempt, refused)
+                }
+                ToGround::Beat(beat) => ToAircraft::Answer {
+                    origin: origin(),
+                    stamp: beat.stamp,
+                    newest_action: 0,
+                },
+                _ => continue,
+            };
+            link.take(&answer.datagram(None), at_ms(ms));
         }
     }
     assert_eq!(sent_ms, [0, 1_000, 3_000, 7_000, 15_000]);

@@ -276,8 +276,7 @@ fn a_changed_digit_is_set_aside_and_never_signed() {
     let mut outbox = place.open();
     outbox.put(&alarm(1, 1), NOW).unwrap();
     outbox.put(&alarm(2, 1), NOW).unwrap();
-    let moved =
-        "UPDATE alarms SET json = replace(json, '31.409422', '31.409423') WHERE id = 'uav-1-1'";
+    let moved = "UPDATE alarms SET json = replace(json, '0.91', '0.19') WHERE id = 'uav-1-1'";
     assert_eq!(outbox.database.execute(moved, []).unwrap(), 1);
     assert_eq!(ids(&mut outbox, "ip"), [("uav-1-2".to_owned(), 1)]);
     assert_eq!(outbox.unreadable(), 1);
