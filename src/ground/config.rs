@@ -2,8 +2,8 @@
 //! at once.
 
 use super::doors::{self, Doors, RawDoors};
-use super::screens::config::{self as screens, RawScreens, ScreensConfig};
 use super::receive::Keyring;
+use super::screens::config::{self as screens, RawScreens, ScreensConfig};
 use crate::deliver::keys::PublicKey;
 use emberfix_calib::{KeyProblem, toml_problem, unknown_keys};
 use emberfix_mav::{LinkUrl, LinkUrlError, SigningKey};

@@ -45,8 +45,8 @@ mod ledger;
 mod mavlink;
 mod merge;
 mod page;
-mod screens;
 pub mod receive;
+mod screens;
 mod server;
 pub mod store;
 #[cfg(test)]
