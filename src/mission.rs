@@ -15,7 +15,11 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 mod gimbal;
+mod links;
 mod terrain;
+
+pub use links::{GroundLinks, MavlinkSigning, load_signing_key};
+use links::{RawGround, RawMavlink};
 
 /// Why a mission file was refused.
 #[derive(Debug, thiserror::Error)]
@@ -72,6 +76,8 @@ pub struct Mission {
     pub system_id: u8,
     /// Where MAVLink comes from.
     pub mavlink_url: String,
+    /// How MAVLink is signed, if it is.
+    pub mavlink_signing: Option<MavlinkSigning>,
     /// Where stereo pairs come from.
     pub camera_url: String,
     /// The detector.
@@ -92,15 +98,8 @@ pub struct Mission {
     pub ground: GroundLinks,
     /// Where the outbox lies.
     pub state_dir: PathBuf,
-}
-
-/// How alarms reach the ground.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct GroundLinks {
-    /// HTTP address of the ground station, if there is an IP path.
-    pub url: Option<String>,
-    /// MAVLink address (system, component) of our ground agent.
-    pub agent: (u8, u8),
+    /// What alarms are signed with; by default `uav.key` in the state folder. Made when it is not there.
+    pub key_path: Option<PathBuf>,
 }
 
 #[derive(Deserialize)]
@@ -111,7 +110,7 @@ struct RawMission {
     datum: RawPlace,
     #[serde(default)]
     vehicle: RawVehicle,
-    mavlink: RawUrl,
+    mavlink: RawMavlink,
     camera: RawUrl,
     model: RawModel,
     #[serde(default)]
@@ -221,27 +220,10 @@ impl Default for RawTrack {
     }
 }
 
-#[derive(Deserialize)]
-#[serde(default)]
-struct RawGround {
-    url: Option<String>,
-    agent_system_id: u8,
-    agent_component_id: u8,
-}
-
-impl Default for RawGround {
-    fn default() -> Self {
-        Self {
-            url: None,
-            agent_system_id: 254,
-            agent_component_id: 191,
-        }
-    }
-}
-
 #[derive(Deserialize, Default)]
 struct RawState {
     dir: Option<PathBuf>,
+    key: Option<PathBuf>,
 }
 
 const KNOWN: &[&str] = &[
@@ -253,6 +235,8 @@ const KNOWN: &[&str] = &[
     "datum.height_ellipsoid_m",
     "vehicle.system_id",
     "mavlink.url",
+    "mavlink.signing_key",
+    "mavlink.unsigned_ids",
     "camera.url",
     "model.path",
     "model.sha256",
@@ -293,13 +277,24 @@ const KNOWN: &[&str] = &[
     "track.confirm_span_s",
     "track.forget_suspected_s",
     "ground.url",
+    "ground.datagrams",
+    "ground.public_key",
     "ground.agent_system_id",
     "ground.agent_component_id",
     "state.dir",
+    "state.key",
     "sim.*",
 ];
 
 impl Mission {
+    /// Where the key is that alarms are signed with.
+    #[must_use]
+    pub fn key_file(&self) -> PathBuf {
+        self.key_path
+            .clone()
+            .unwrap_or_else(|| self.state_dir.join("uav.key"))
+    }
+
     /// Reads and checks a mission file and the rig that it names.
     ///
     /// # Errors
@@ -386,6 +381,7 @@ fn check(raw: &RawMission) -> Vec<String> {
         gimbal.check(&mut checks);
     }
     check_sigma(&mut checks, &raw.sigma);
+    raw.ground.check(&mut checks);
     checks.range(
         "track.confirm_sightings",
         f64::from(raw.track.confirm_sightings),
@@ -489,6 +485,13 @@ fn build(raw: RawMission, path: &Path) -> Result<Mission, MissionError> {
             path: path.to_owned(),
             problems,
         })?;
+    let mavlink_signing = raw
+        .mavlink
+        .signing(&beside)
+        .map_err(|problem| MissionError::Values {
+            path: path.to_owned(),
+            problems: vec![problem],
+        })?;
     let state_dir = raw
         .state
         .dir
@@ -525,10 +528,9 @@ fn build(raw: RawMission, path: &Path) -> Result<Mission, MissionError> {
             confirm_span_s: raw.track.confirm_span_s,
             forget_suspected_s: raw.track.forget_suspected_s,
         },
-        ground: GroundLinks {
-            url: raw.ground.url,
-            agent: (raw.ground.agent_system_id, raw.ground.agent_component_id),
-        },
+        ground: raw.ground.build(),
+        mavlink_signing,
+        key_path: raw.state.key.as_deref().map(beside),
         name: raw.name,
         uav: raw.uav,
         rig_path: beside(&raw.rig),

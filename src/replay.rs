@@ -102,6 +102,9 @@ impl Replay {
                         results.take(self.pipeline.handle(arrived, event))?;
                     }
                 }
+                Some(Recorded::Action { arrived, action }) => {
+                    results.take(self.pipeline.handle(arrived, Event::Action(action)))?;
+                }
                 Some(Recorded::Pair(pair)) => {
                     pairs += 1;
                     progress(pairs);

@@ -76,6 +76,9 @@ fn told(right_from_left_rotation_deg: &str) -> Vec<&'static str> {
             Recorded::Pair(pair) => {
                 pipeline.handle(pair.value.arrived, Event::Pair(Box::new(pair)));
             }
+            Recorded::Action { arrived, action } => {
+                pipeline.handle(arrived, Event::Action(action));
+            }
             Recorded::Calibration { .. } => {}
         }
     }

@@ -2,10 +2,10 @@
 //!
 //! **Purpose.** Between a port and the rest: [`wire`] finds checked frames in bytes, [`telemetry`]
 //! says what they mean, [`outgoing`] writes messages, [`link`] is the port itself, [`inbox`] keeps its
-//! peers apart, [`tlog`] reads
+//! peers apart, [`signing`] signs and judges, [`tlog`] reads
 //! ground stations' logs. All but `link` are sans-IO: bytes and times are arguments.
 //!
-//! **In.** MAVLink 1 and 2, signed frames too (signatures are carried, not verified), dialect
+//! **In.** MAVLink 1 and 2, signed frames too ([`signing`] judges them where a key is given), dialect
 //! `development`, which includes `common`. **Out.** [`Telemetry`] in SI units: degrees only in
 //! names that end in `_deg`, altitudes as [`emberfix_frames::MslAltitude`] or
 //! [`emberfix_frames::EllipsoidHeight`], times as the autopilot's boot time; attitude is body
@@ -21,6 +21,7 @@
 pub mod inbox;
 pub mod link;
 pub mod outgoing;
+pub mod signing;
 pub mod telemetry;
 pub mod tlog;
 pub mod traffic;
@@ -29,6 +30,7 @@ pub mod wire;
 pub use inbox::Inbox;
 pub use link::{Chunk, Link, LinkError, LinkUrl, LinkUrlError, Peer};
 pub use outgoing::{EncodeError, Encoder, MavMessage};
+pub use signing::{Guard, Judgement, Signer, SigningKey, SigningState};
 pub use telemetry::{DecodeError, Received, Telemetry, decode, message_name};
 pub use wire::{
     Address, ComponentId, FrameCheck, FrameReader, RawFrame, SystemId, WireCounters, WireVersion,

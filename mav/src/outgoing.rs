@@ -4,16 +4,17 @@
 //! what one side writes is what the other side reads. Values beyond a field's range saturate;
 //! `None` is written the way each field spells "unknown".
 
+use crate::signing::Signer;
 use crate::telemetry::{
     AttitudeSample, CameraTrackingGeoStatus, CommandAck, CommandInt, CommandLong, CommandResult,
     EstimatorStatus, GlobalPosition, GnssFix, GnssPlace, GpsRaw, Heartbeat, HomePosition, Severity,
     StatusText, SystemTime, TimeSyncMessage, VehicleTime,
 };
 use crate::wire::Address;
-use emberfix_frames::BootTime;
+use emberfix_frames::{BootTime, ServiceTime};
 use mavlink::dialects::development as dialect;
 use mavlink::types::CharArray;
-use mavlink::{MAVLinkV2MessageRaw, MavHeader};
+use mavlink::{MAVLinkV2MessageRaw, MavHeader, Message as _};
 use num_traits::FromPrimitive;
 
 pub use mavlink::dialects::development::MavMessage;
@@ -29,6 +30,8 @@ pub mod command {
     pub const REQUEST_MESSAGE: u32 = 512;
     /// `MAV_CMD_SPATIAL_USER_1`: a place whose meaning its users agree on.
     pub const SPATIAL_USER_1: u32 = 31_005;
+    /// `MAV_CMD_USER_2`: what its users agree on.
+    pub const USER_2: u32 = 31_011;
 }
 
 /// Message ids that we ask for, as MAVLink numbers them.
@@ -76,11 +79,12 @@ pub enum EncodeError {
     },
 }
 
-/// Messages to MAVLink 2 frames of one sender; counts the sequence.
+/// Messages to MAVLink 2 frames of one sender; counts the sequence, and signs where it has a signer.
 #[derive(Debug, Clone)]
 pub struct Encoder {
     sender: Address,
     sequence: u8,
+    signer: Option<Signer>,
 }
 
 impl Encoder {
@@ -90,6 +94,21 @@ impl Encoder {
         Self {
             sender,
             sequence: 0,
+            signer: None,
+        }
+    }
+
+    /// Signs every frame from now on.
+    #[must_use]
+    pub fn signing(mut self, signer: Option<Signer>) -> Self {
+        self.signer = signer;
+        self
+    }
+
+    /// The time of signatures is at least this.
+    pub fn advance(&mut self, now: ServiceTime) {
+        if let Some(signer) = &mut self.signer {
+            signer.advance(now);
         }
     }
 
@@ -109,7 +128,11 @@ impl Encoder {
         self.sequence = self.sequence.wrapping_add(1);
         let mut raw = MAVLinkV2MessageRaw::new();
         raw.serialize_message(header, message);
-        raw.raw_bytes().to_vec()
+        let frame = raw.raw_bytes();
+        match &mut self.signer {
+            Some(signer) => signer.sign(frame, MavMessage::extra_crc(message.message_id())),
+            None => frame.to_vec(),
+        }
     }
 }
 

@@ -1,6 +1,6 @@
 //! When a fire is told, and when told again.
 
-use super::{Advice, Alarm, AlarmProperties, FireId, FireState};
+use super::{Action, Advice, Alarm, AlarmProperties, Attention, FireId, FireState};
 use super::{Area, Burning, SizeM, TrendProbability};
 use crate::assess::extent::{Measured, SizeClass};
 use crate::assess::trend::Course;
@@ -9,7 +9,7 @@ use crate::track::Fire;
 use emberfix_frames::{
     Covariance, HeightAboveGround, MissionEnu, MslAltitude, ServiceTime, Wgs84, enu_offset,
 };
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// Where a fire is on the Earth, as far as the alarm needs it.
 #[derive(Debug, Clone, PartialEq)]
@@ -34,12 +34,14 @@ pub struct Situation {
 ///
 /// A fire is told when it is confirmed. It is told again when its state changes, when it moved by
 /// more than half of the CE90 that was told, when CE90 fell below 0.7 of what was told, when a channel
-/// of its light was lost, and every [`REPEAT_S`] while it is still seen; except for changes of state never more often than every
-/// [`LEAST_S`], so that a busy scene leaves the link to new fires.
+/// of its light was lost, and every [`REPEAT_S`] while it is still seen; except for changes of state
+/// never more often than every [`LEAST_S`], so that a busy scene leaves the link to new fires. One that
+/// an operator dismissed is told no more until an operator says otherwise.
 #[derive(Debug)]
 pub struct AlarmDesk {
     uav: String,
     told: BTreeMap<FireId, Told>,
+    dismissed: BTreeSet<FireId>,
 }
 
 #[derive(Debug, Clone)]
@@ -69,7 +71,29 @@ impl AlarmDesk {
         Self {
             uav,
             told: BTreeMap::new(),
+            dismissed: BTreeSet::new(),
         }
+    }
+
+    /// Takes in what an operator did; false when it is about another aircraft's alarm.
+    pub fn note(&mut self, action: &Action) -> bool {
+        let number = action
+            .alarm
+            .strip_prefix(&self.uav)
+            .and_then(|rest| rest.strip_prefix('-'));
+        let Some(fire) = number.and_then(|number| number.parse().ok()).map(FireId) else {
+            return false;
+        };
+        match action.kind.attention() {
+            Some(Attention::Dismissed) => {
+                self.dismissed.insert(fire);
+            }
+            Some(Attention::Wanted | Attention::Seen) => {
+                self.dismissed.remove(&fire);
+            }
+            None => {}
+        }
+        true
     }
 
     /// The alarms that are due. `situate` places a fire on the Earth; one that is nowhere on it is
@@ -82,7 +106,8 @@ impl AlarmDesk {
         let mut due = Vec::new();
         for fire in fires.iter().filter(|fire| fire.is_confirmed()) {
             let never_told = !self.told.contains_key(&fire.id);
-            if never_told && fire.state == FireState::Out {
+            let ended_untold = never_told && fire.state == FireState::Out;
+            if ended_untold || self.dismissed.contains(&fire.id) {
                 continue;
             }
             let Some(situation) = situate(fire) else {

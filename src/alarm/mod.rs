@@ -4,9 +4,11 @@
 //! latitude, ellipsoid height). The position is the base of the fire: where the burning thing
 //! stands, beneath the flame's centre. Pure: no I/O, no clock.
 
+mod action;
 mod burning;
 mod desk;
 
+pub use action::{Action, ActionKind, Attention};
 pub use burning::{Area, Burning, TrendProbability};
 pub use desk::{AlarmDesk, LEAST_S, REPEAT_S, Situation};
 

@@ -182,7 +182,7 @@ pub fn gather(
                 gatherer.take_pair(pair);
                 progress(gatherer.gathered.pairs);
             }
-            Recorded::Calibration { .. } => {}
+            Recorded::Calibration { .. } | Recorded::Action { .. } => {}
         }
     }
     Ok(gatherer.finish())

@@ -6,6 +6,7 @@
 mod calibrate;
 mod doctor;
 mod eval;
+mod keys;
 mod replay;
 mod run;
 
@@ -32,6 +33,8 @@ enum Command {
     Replay(replay::ReplayArguments),
     /// Runs the ground station: receives, keeps and shows alarms.
     Ground(GroundArguments),
+    /// Makes the aircraft's key where there is none, and prints the public one.
+    Keys(keys::KeysArguments),
     /// Checks everything before take-off: a table of pass, warn, fail, with remedies.
     Doctor(doctor::DoctorArguments),
     /// Calibrates a rig, or brings one in from another program's file.
@@ -90,6 +93,7 @@ pub fn main() -> ExitCode {
         Command::Run(arguments) => run::run(arguments),
         Command::Replay(arguments) => replay::replay(&arguments),
         Command::Ground(arguments) => ground(arguments),
+        Command::Keys(arguments) => keys::keys(arguments),
         Command::Doctor(arguments) => doctor::doctor(&arguments),
         Command::Calibrate(what) => calibrate::calibrate(&what),
         Command::Eval(what) => eval::eval(&what),

@@ -1,20 +1,25 @@
-//! The link over IP: `POST /alarms` to the ground station.
+//! One exchange with the ground station over HTTP: the plain door, and the way of what fits into no
+//! datagram.
 //!
-//! **In:** an [`Alarm`]. **Out:** a [`Receipt`], only when the ground says that it is stored.
-//! Blocking, bounded in time; one connection is kept open between alarms. No retry here: the outbox
-//! owns that. **Known limits:** plain HTTP (a VPN guards it); no redirects; no proxies.
+//! **In:** a [`Letter`]. `POST /alarms` carries the alarm's exact bytes as its body, and what is signed
+//! around them in a header ([`envelope::HTTP_HEADER`]). **Out:** a [`Receipt`], only when the ground says
+//! that it is stored. Blocking, bounded in time; connections are kept open between alarms. No retry
+//! here: [`super::lanes`] and the outbox own that. `POST /wire` carries one datagram each way, for what
+//! else the two sides have to say. **Known limits:** no redirects; no proxies.
 
-use super::{AlarmLink, LinkError, Receipt};
+use super::datagram::wire::{ToAircraft, ToGround, Verdict};
+use super::keys::{PublicKey, SecretKey};
+use super::{Letter, Receipt, Settled, envelope};
 use crate::alarm::Alarm;
 use crate::ground::Ping;
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD as BASE64;
 use emberfix_frames::ServiceTime;
 use serde::Deserialize;
 use std::time::Duration;
 use ureq::http::{Response, StatusCode};
 use ureq::{Agent, Body};
 
-/// Name of this link in the outbox.
-const LINK_NAME: &str = "http";
 /// Longest wait for a connection.
 const CONNECT: Duration = Duration::from_secs(2);
 /// Longest whole exchange. A disk that syncs slowly takes a second; beyond five the outbox tries
@@ -22,6 +27,8 @@ const CONNECT: Duration = Duration::from_secs(2);
 const EXCHANGE: Duration = Duration::from_secs(5);
 /// Largest answer that is read, bytes.
 const MAX_ANSWER: u64 = 16 * 1024;
+/// The header of an answer that carries the ground's signed receipt.
+pub const RECEIPT_HEADER: &str = "emberfix-receipt";
 
 /// Why an alarm or a position did not arrive, as far as the aircraft knows.
 #[derive(Debug, thiserror::Error)]
@@ -58,6 +65,12 @@ pub enum HttpError {
         /// HTTP status.
         status: u16,
     },
+    /// An answer that the ground whose key we hold did not sign.
+    #[error("what answers at {url} is not the ground station whose key the mission names")]
+    Forged {
+        /// What was asked.
+        url: String,
+    },
 }
 
 impl HttpError {
@@ -81,6 +94,19 @@ struct Stored {
     stored: bool,
 }
 
+impl Stored {
+    fn is_of(&self, id: &str, revision: u32) -> bool {
+        self.stored && self.id == id && self.revision == revision
+    }
+
+    fn receipt(self) -> Receipt {
+        Receipt {
+            id: self.id,
+            revision: self.revision,
+        }
+    }
+}
+
 /// What a ground station says of itself.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct StationHealth {
@@ -102,11 +128,34 @@ struct Refusal {
     error: String,
 }
 
+/// How an exchange went, and what else the ground said.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Told {
+    /// How it went.
+    pub settled: Settled,
+    /// Greatest number of an operator's action for us; 0 where nothing was said.
+    pub newest_action: u64,
+}
+
+impl Told {
+    /// Nobody heard it.
+    #[must_use]
+    pub fn unreachable(reason: &str) -> Self {
+        Self {
+            settled: Settled::Unreachable {
+                reason: reason.to_owned(),
+            },
+            newest_action: 0,
+        }
+    }
+}
+
 /// A ground station reached over HTTP.
 #[derive(Debug, Clone)]
 pub struct HttpLink {
     base_url: String,
     agent: Agent,
+    ground: Option<PublicKey>,
 }
 
 impl HttpLink {
@@ -136,7 +185,29 @@ impl HttpLink {
         Ok(Self {
             base_url: trimmed.to_owned(),
             agent: config.into(),
+            ground: None,
         })
+    }
+
+    /// Believes only answers that this ground signed.
+    #[must_use]
+    pub fn trusting(mut self, ground: Option<PublicKey>) -> Self {
+        self.ground = ground;
+        self
+    }
+
+    /// Host and port.
+    #[must_use]
+    pub fn place(&self) -> String {
+        let place = self.base_url.trim_start_matches("http://");
+        let has_port = place
+            .rfind(':')
+            .is_some_and(|at| !place[at..].contains(']'));
+        if has_port {
+            place.to_owned()
+        } else {
+            format!("{place}:80")
+        }
     }
 
     /// Where it sends to.
@@ -145,30 +216,127 @@ impl HttpLink {
         &self.base_url
     }
 
-    /// Sends one revision; `Ok` only when the ground says that this revision is on its disk.
+    /// Sends one revision; `Ok` only when the ground says that this revision is on its disk. The
+    /// number is that of the newest operator's action.
     ///
     /// # Errors
     /// [`HttpError`]; see [`HttpError::is_about_the_alarm`].
-    pub fn send_alarm(&self, alarm: &Alarm) -> Result<Receipt, HttpError> {
+    pub fn send_letter(&self, letter: &Letter) -> Result<(Receipt, u64), HttpError> {
         let url = format!("{}/alarms", self.base_url);
-        let mut answer = self.post(
-            &url,
-            "application/geo+json",
-            &alarm.to_geojson().to_string(),
-        )?;
+        let sealed = &letter.sealed;
+        let head = sealed.envelope.http_header(sealed.signature.as_ref());
+        let request = self
+            .agent
+            .post(&url)
+            .header("content-type", "application/geo+json")
+            .header(envelope::HTTP_HEADER, head);
+        let sent = request.send(&sealed.envelope.alarm[..]);
+        let mut answer = sent.map_err(|source| unreachable(&url, source))?;
         let status = check_status(&url, &mut answer)?;
-        let stored = read_json::<Stored>(&mut answer);
-        let sent = &alarm.properties;
-        match stored {
-            Some(Stored {
-                id,
-                revision,
-                stored: true,
-            }) if id == sent.id && revision == sent.revision => Ok(Receipt { id, revision }),
+        let newest_action = self.check_receipt(&url, letter, &answer)?;
+        match read_json::<Stored>(&mut answer) {
+            Some(said) if said.is_of(letter.id(), letter.revision()) => {
+                Ok((said.receipt(), newest_action))
+            }
             _ => Err(HttpError::NoReceipt {
                 url,
                 status: status.as_u16(),
             }),
+        }
+    }
+
+    /// Sends an alarm by the plain door, unsigned.
+    ///
+    /// # Errors
+    /// [`HttpError`].
+    pub fn send_alarm(&self, alarm: &Alarm) -> Result<Receipt, HttpError> {
+        let url = format!("{}/alarms", self.base_url);
+        let json = alarm.to_geojson().to_string();
+        let mut answer = self.post(&url, "application/geo+json", &json)?;
+        let status = check_status(&url, &mut answer)?.as_u16();
+        let properties = &alarm.properties;
+        match read_json::<Stored>(&mut answer) {
+            Some(said) if said.is_of(&properties.id, properties.revision) => Ok(said.receipt()),
+            _ => Err(HttpError::NoReceipt { url, status }),
+        }
+    }
+
+    /// Sends one revision, and says how it went in the words of links.
+    #[must_use]
+    pub fn tell(&self, letter: &Letter) -> Told {
+        match self.send_letter(letter) {
+            Ok((receipt, newest_action)) => Told {
+                settled: Settled::Delivered(receipt),
+                newest_action,
+            },
+            Err(error) if error.is_about_the_alarm() => Told {
+                settled: Settled::Refused {
+                    id: letter.id().to_owned(),
+                    revision: letter.revision(),
+                    reason: error.to_string(),
+                },
+                newest_action: 0,
+            },
+            Err(error) => Told::unreachable(&error.to_string()),
+        }
+    }
+
+    /// Says something that is no alarm, and hears the answer.
+    ///
+    /// # Errors
+    /// [`HttpError`].
+    pub fn exchange(
+        &self,
+        said: &ToGround,
+        key: Option<&SecretKey>,
+    ) -> Result<ToAircraft, HttpError> {
+        let url = format!("{}/wire", self.base_url);
+        let request = self.agent.post(&url).header("content-type", WIRE_KIND);
+        let sent = request.send(&said.datagram(key)[..]);
+        let mut answer = sent.map_err(|source| unreachable(&url, source))?;
+        let status = check_status(&url, &mut answer)?.as_u16();
+        let bytes = read_bytes(&mut answer).unwrap_or_default();
+        let no_receipt = |url| HttpError::NoReceipt { url, status };
+        let (answer, signed) = ToAircraft::read(&bytes).map_err(|_| no_receipt(url.clone()))?;
+        if self.ground.is_some_and(|key| !signed.is_by(&key)) {
+            return Err(HttpError::Forged { url });
+        }
+        Ok(answer)
+    }
+
+    /// What the ground signed beside its answer: the newest action. Without a key to check it with,
+    /// none is needed.
+    fn check_receipt(
+        &self,
+        url: &str,
+        letter: &Letter,
+        answer: &Response<Body>,
+    ) -> Result<u64, HttpError> {
+        let header = answer.headers().get(RECEIPT_HEADER);
+        let read = header
+            .and_then(|header| BASE64.decode(header.as_bytes()).ok())
+            .and_then(|bytes| ToAircraft::read(&bytes).ok());
+        let forged = || HttpError::Forged {
+            url: url.to_owned(),
+        };
+        let Some((said, signed)) = read else {
+            return self.ground.map_or(Ok(0), |_| Err(forged()));
+        };
+        let ours = self.ground.is_none_or(|key| signed.is_by(&key));
+        match said {
+            ToAircraft::Receipt {
+                origin,
+                sequence,
+                verdict: Verdict::Stored,
+                newest_action,
+                ..
+            } if ours
+                && origin == letter.sealed.envelope.origin
+                && sequence == letter.sequence() =>
+            {
+                Ok(newest_action)
+            }
+            _ => Err(forged()),
         }
     }
 
@@ -232,43 +400,27 @@ impl HttpLink {
             .post(url)
             .header("content-type", kind)
             .send(json)
-            .map_err(|source| HttpError::Unreachable {
-                url: url.to_owned(),
-                source: Box::new(source),
-            })
+            .map_err(|source| unreachable(url, source))
     }
 }
 
-impl AlarmLink for HttpLink {
-    fn name(&self) -> &'static str {
-        LINK_NAME
-    }
+/// What `POST /wire` carries.
+pub const WIRE_KIND: &str = "application/octet-stream";
 
-    fn send(&mut self, alarm: &Alarm) -> Result<Receipt, LinkError> {
-        self.send_alarm(alarm).map_err(|error| {
-            let (link, reason) = (LINK_NAME, error.to_string());
-            if !error.is_about_the_alarm() {
-                return LinkError::Unreachable { link, reason };
-            }
-            let sent = &alarm.properties;
-            LinkError::Refused {
-                link,
-                id: sent.id.clone(),
-                revision: sent.revision,
-                reason,
-            }
-        })
+fn unreachable(url: &str, source: ureq::Error) -> HttpError {
+    HttpError::Unreachable {
+        url: url.to_owned(),
+        source: Box::new(source),
     }
 }
 
 fn read_json<T: serde::de::DeserializeOwned>(answer: &mut Response<Body>) -> Option<T> {
-    let text = answer
-        .body_mut()
-        .with_config()
-        .limit(MAX_ANSWER)
-        .read_to_vec()
-        .ok()?;
-    serde_json::from_slice(&text).ok()
+    serde_json::from_slice(&read_bytes(answer)?).ok()
+}
+
+fn read_bytes(answer: &mut Response<Body>) -> Option<Vec<u8>> {
+    let body = answer.body_mut().with_config().limit(MAX_ANSWER);
+    body.read_to_vec().ok()
 }
 
 fn check_status(url: &str, answer: &mut Response<Body>) -> Result<StatusCode, HttpError> {
@@ -290,12 +442,8 @@ fn check_status(url: &str, answer: &mut Response<Body>) -> Result<StatusCode, Ht
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::deliver::tests_support::letter;
     use std::io::{Read, Write};
-
-    fn alarm() -> Alarm {
-        let text = crate::ground::store::tests::feature("gaochun-1", 1, "2026-03-01T12:00:01Z");
-        Alarm::from_geojson(text.as_bytes()).unwrap()
-    }
 
     /// A server that gives one canned answer and is gone.
     fn answering(answer: &'static str) -> HttpLink {
@@ -319,12 +467,12 @@ mod tests {
 
     #[test]
     fn only_a_receipt_for_this_very_revision_counts_as_stored() {
-        let sent = |answer| answering(answer).send_alarm(&alarm());
-        let good = r#"201 Created|{"id":"gaochun-1","revision":1,"stored":true}"#;
-        assert_eq!(sent(good).unwrap().revision, 1);
+        let sent = |answer| answering(answer).send_letter(&letter(1, 1));
+        let good = r#"201 Created|{"id":"uav-1-1","revision":1,"stored":true}"#;
+        assert_eq!(sent(good).unwrap().0.revision, 1);
         for bad in [
-            r#"200 OK|{"id":"gaochun-1","revision":2,"stored":true}"#,
-            r#"200 OK|{"id":"gaochun-1","revision":1,"stored":false}"#,
+            r#"200 OK|{"id":"uav-1-1","revision":2,"stored":true}"#,
+            r#"200 OK|{"id":"uav-1-1","revision":1,"stored":false}"#,
             "200 OK|<html>welcome to the hotel</html>",
         ] {
             assert!(
@@ -341,30 +489,38 @@ mod tests {
 
     #[test]
     fn a_refused_alarm_is_told_from_a_link_that_fails() {
-        let outcome = |answer| answering(answer).send(&alarm()).unwrap_err();
+        let outcome = |answer| answering(answer).tell(&letter(1, 1)).settled;
         match outcome(r#"409 Conflict|{"error":"numbering has restarted"}"#) {
-            LinkError::Refused {
+            Settled::Refused {
                 id,
                 revision,
                 reason,
-                ..
             } => {
-                assert_eq!((id.as_str(), revision), ("gaochun-1", 1));
+                assert_eq!((id.as_str(), revision), ("uav-1-1", 1));
                 assert!(reason.contains("numbering has restarted"), "{reason}");
             }
-            other @ LinkError::Unreachable { .. } => panic!("{other}"),
+            other => panic!("{other:?}"),
         }
         for failing in ["503 Service Unavailable|", "404 Not Found|", "200 OK|hello"] {
-            assert!(
-                matches!(outcome(failing), LinkError::Unreachable { .. }),
-                "{failing}"
-            );
+            let told = outcome(failing);
+            assert!(matches!(told, Settled::Unreachable { .. }), "{failing}");
         }
-        let mut nobody = HttpLink::new("http://127.0.0.1:9").unwrap();
-        assert!(matches!(
-            nobody.send(&alarm()),
-            Err(LinkError::Unreachable { .. })
-        ));
+        let nobody = HttpLink::new("http://127.0.0.1:9").unwrap();
+        let told = nobody.tell(&letter(1, 1)).settled;
+        assert!(matches!(told, Settled::Unreachable { .. }));
+    }
+
+    #[test]
+    fn a_receipt_that_the_ground_did_not_sign_is_none() {
+        let good = r#"201 Created|{"id":"uav-1-1","revision":1,"stored":true}"#;
+        let key = SecretKey::random().public();
+        let refused = answering(good)
+            .trusting(Some(key))
+            .send_letter(&letter(1, 1));
+        assert!(
+            matches!(refused, Err(HttpError::Forged { .. })),
+            "{refused:?}"
+        );
     }
 
     #[test]

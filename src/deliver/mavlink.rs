@@ -11,16 +11,20 @@
 //!
 //! New fires go first, then texts, then repetitions, then the camera status. Frames are at least
 //! 50 ms apart and together at most 120 B/s sustained ([`Pacing`]): a 9600 baud radio carries them
-//! and still has room for telemetry.
+//! and still has room for telemetry. While a radio says (RADIO_STATUS) that its buffer fills, they
+//! take down to a tenth of that.
+//!
+//! An alarm that an operator has seen to gets no more texts; one that was dismissed is nobody's
+//! target, until an operator says otherwise.
 //!
 //! **Bound:** [`MavlinkDelivery::MAX_FIRES`] fires. **Loss rule:** delivered ones make room, the
 //! least recent first; if all wait, a further one is not taken, and stays in the outbox. After a
 //! restart the texts of what still waits are said once more.
 
-use super::link::{FIRST_RETRY, pause_after};
+use super::link::{AlarmLink, FIRST_RETRY, Letter, Settled, pause_after};
 use super::spatial::{self, SpatialError, SpatialReceipt, round_sigmas_m};
 use super::{Receipt, Urgency, fire_number};
-use crate::alarm::{Alarm, AlarmClass, AlarmProperties, FireId, FireState};
+use crate::alarm::{Alarm, AlarmClass, AlarmProperties, Attention, FireId, FireState};
 use emberfix_frames::{MslAltitude, ServiceTime, SignedDuration, Wgs84Parts};
 use emberfix_mav::outgoing::{camera_tracking_geo_status, command, command_int, status_text};
 use emberfix_mav::telemetry::{
@@ -59,6 +63,8 @@ pub struct MavlinkSettings {
     pub ground: Address,
     /// How fast.
     pub pacing: Pacing,
+    /// What signing adds to every frame, bytes.
+    pub signature_bytes: usize,
 }
 
 impl MavlinkSettings {
@@ -72,6 +78,7 @@ impl MavlinkSettings {
             own,
             ground: Self::GROUND,
             pacing: Pacing::default(),
+            signature_bytes: 0,
         }
     }
 }
@@ -110,6 +117,8 @@ pub struct MavlinkCounters {
     pub refused: u64,
     /// Answers that belong to nothing that waits.
     pub stray_answers: u64,
+    /// RADIO_STATUSs that slowed us.
+    pub slowed: u64,
 }
 
 /// Tells alarms over MAVLink: what to send when, and what an answer means.
@@ -120,12 +129,14 @@ pub struct MavlinkDelivery {
     pace: Pace,
     camera_due: Option<ServiceTime>,
     ground_heard: Option<ServiceTime>,
+    settled: Vec<Settled>,
     counters: MavlinkCounters,
 }
 
 #[derive(Debug)]
 struct Telling {
     alarm: Alarm,
+    attention: Attention,
     command: CommandState,
     text: TextState,
 }
@@ -183,6 +194,7 @@ impl MavlinkDelivery {
             pace: Pace::new(settings.pacing),
             camera_due: None,
             ground_heard: None,
+            settled: Vec::new(),
             counters: MavlinkCounters::default(),
         }
     }
@@ -206,15 +218,21 @@ impl MavlinkDelivery {
         Ok(())
     }
 
-    /// Takes in what came over the connection; a receipt when it says that an alarm is delivered.
-    pub fn observe(
-        &mut self,
-        from: Address,
-        telemetry: &Telemetry,
-        now: ServiceTime,
-    ) -> Option<Receipt> {
+    /// How much of people's attention each alarm still asks for.
+    pub fn attend(&mut self, attention: impl Fn(&str) -> Attention) {
+        for telling in self.fires.values_mut() {
+            telling.attend(attention(&telling.alarm.properties.id));
+        }
+    }
+
+    /// Takes in what came over the connection.
+    pub fn observe(&mut self, from: Address, telemetry: &Telemetry, now: ServiceTime) {
+        if let Telemetry::RadioStatus(status) = telemetry {
+            let slowed = self.pace.heed(status.free_buffer_percent, now);
+            self.counters.slowed += u64::from(slowed);
+        }
         if from != self.settings.ground {
-            return None;
+            return;
         }
         let back = self
             .ground_heard
@@ -223,11 +241,10 @@ impl MavlinkDelivery {
         if back {
             self.hurry(now);
         }
-        match telemetry {
-            Telemetry::CommandAck(ack) if ack.command == command::SPATIAL_USER_1 => {
-                self.answered(ack, now)
-            }
-            _ => None,
+        if let Telemetry::CommandAck(ack) = telemetry
+            && ack.command == command::SPATIAL_USER_1
+        {
+            self.answered(ack, now);
         }
     }
 
@@ -237,7 +254,8 @@ impl MavlinkDelivery {
             return None;
         }
         let (step, message) = self.next_step(now)?;
-        let frame_len = Encoder::new(self.settings.own).encode(&message).len();
+        let plain_len = Encoder::new(self.settings.own).encode(&message).len();
+        let frame_len = plain_len + self.settings.signature_bytes;
         if !self.pace.spend(frame_len, now) {
             return None;
         }
@@ -295,7 +313,7 @@ impl MavlinkDelivery {
         }
     }
 
-    fn answered(&mut self, ack: &CommandAck, now: ServiceTime) -> Option<Receipt> {
+    fn answered(&mut self, ack: &CommandAck, now: ServiceTime) {
         let answer = SpatialReceipt::read(ack.result_param2);
         let for_us = ack.target.reaches(self.settings.own);
         let telling = self.fires.get_mut(&answer.fire).filter(|telling| {
@@ -303,26 +321,33 @@ impl MavlinkDelivery {
         });
         let Some(telling) = telling else {
             self.counters.stray_answers += 1;
-            return None;
+            return;
         };
+        let properties = &telling.alarm.properties;
+        let (id, revision) = (properties.id.clone(), properties.revision);
         if ack.result != CommandResult::Accepted {
             self.counters.refused += 1;
             telling.refused(ack.result);
-            return None;
+            self.settled.push(Settled::Refused {
+                id,
+                revision,
+                reason: format!("{:?}", ack.result),
+            });
+            return;
         }
         telling.command = CommandState::Delivered;
         telling.text.heard();
+        self.settled
+            .push(Settled::Delivered(Receipt { id, revision }));
         self.counters.delivered += 1;
         self.hurry(now);
-        self.receipt(answer.fire)
     }
 
-    fn receipt(&self, fire: FireId) -> Option<Receipt> {
-        let properties = &self.fires.get(&fire)?.alarm.properties;
-        Some(Receipt {
-            id: properties.id.clone(),
-            revision: properties.revision,
-        })
+    /// What waits no more was delivered another way, or is not owed.
+    fn forget_all_but(&mut self, waiting: &[Letter]) {
+        let waits = |id: &str| waiting.iter().any(|letter| letter.id() == id);
+        self.fires
+            .retain(|_, telling| telling.is_delivered() || waits(&telling.alarm.properties.id));
     }
 
     /// What comes next, if it is due; in the order of the room's doc.
@@ -404,6 +429,26 @@ impl MavlinkDelivery {
     }
 }
 
+impl AlarmLink for MavlinkDelivery {
+    fn name(&self) -> &'static str {
+        Self::NAME
+    }
+
+    fn work(&mut self, waiting: &[Letter], _now: ServiceTime) -> Vec<Settled> {
+        self.forget_all_but(waiting);
+        for letter in waiting {
+            if let Err(error) = self.offer(&letter.alarm) {
+                self.settled.push(Settled::Refused {
+                    id: letter.id().to_owned(),
+                    revision: letter.revision(),
+                    reason: error.to_string(),
+                });
+            }
+        }
+        std::mem::take(&mut self.settled)
+    }
+}
+
 #[derive(Debug, Clone, Copy)]
 enum Step {
     Command(FireId),
@@ -416,6 +461,7 @@ impl Telling {
         let text = TextState::Due { said: 0, at: None };
         Self {
             alarm: alarm.clone(),
+            attention: Attention::Wanted,
             command: CommandState::Never,
             text,
         }
@@ -438,6 +484,20 @@ impl Telling {
             };
         }
         self.alarm = alarm.clone();
+    }
+
+    /// Seen: no texts but the one that it is out. Dismissed: none at all.
+    fn attend(&mut self, attention: Attention) {
+        let burns = self.alarm.properties.state != FireState::Out;
+        match attention {
+            Attention::Wanted => {}
+            Attention::Seen if burns || self.attention != attention => {
+                self.text = TextState::Said;
+            }
+            Attention::Seen => {}
+            Attention::Dismissed => self.text = TextState::Said,
+        }
+        self.attention = attention;
     }
 
     fn is_delivered(&self) -> bool {
@@ -500,7 +560,9 @@ impl Telling {
 
     fn is_in_sight(&self, now: ServiceTime) -> bool {
         let properties = &self.alarm.properties;
-        properties.state != FireState::Out && now - properties.captured_at <= CAMERA_MEMORY
+        self.attention != Attention::Dismissed
+            && properties.state != FireState::Out
+            && now - properties.captured_at <= CAMERA_MEMORY
     }
 }
 
@@ -541,6 +603,9 @@ impl TextState {
 #[derive(Debug)]
 struct Pace {
     pacing: Pacing,
+    /// Of the sustained rate, in 0..1: what a radio's buffer leaves to us.
+    share: f64,
+    heeded: Option<ServiceTime>,
     tokens: f64,
     filled_at: Option<ServiceTime>,
     last_frame: Option<ServiceTime>,
@@ -550,6 +615,8 @@ impl Pace {
     fn new(pacing: Pacing) -> Self {
         Self {
             pacing,
+            share: 1.0,
+            heeded: None,
             tokens: pacing.burst_bytes,
             filled_at: None,
             last_frame: None,
@@ -561,12 +628,33 @@ impl Pace {
             .is_none_or(|last| now - last >= self.pacing.gap)
     }
 
+    /// A radio told how much of its buffer is free; true when that slows us.
+    fn heed(&mut self, free_percent: u8, now: ServiceTime) -> bool {
+        let step = match free_percent {
+            0..20 => 0.5,
+            20..50 => 0.8,
+            50..90 => 1.0,
+            _ => 1.25,
+        };
+        self.heeded = Some(now);
+        self.share = (self.share * step).clamp(LEAST_SHARE, 1.0);
+        step < 1.0
+    }
+
+    /// A radio that says nothing any more holds nothing up.
+    fn share(&self, now: ServiceTime) -> f64 {
+        let fresh = self
+            .heeded
+            .is_some_and(|heeded| now - heeded < RADIO_SILENCE);
+        if fresh { self.share } else { 1.0 }
+    }
+
     /// False, and nothing spent, when there is no room for a frame of this length yet.
     fn spend(&mut self, frame_len: usize, now: ServiceTime) -> bool {
         let since_s = self
             .filled_at
             .map_or(0.0, |filled| (now - filled).as_secs_f64());
-        let gained = since_s.max(0.0) * self.pacing.bytes_per_s;
+        let gained = since_s.max(0.0) * self.pacing.bytes_per_s * self.share(now);
         self.tokens = (self.tokens + gained).min(self.pacing.burst_bytes);
         self.filled_at = Some(now);
         let needed = frame_len as f64;
@@ -578,6 +666,11 @@ impl Pace {
         true
     }
 }
+
+/// Least share of the sustained rate: one alarm in five seconds still goes, whatever a radio says.
+const LEAST_SHARE: f64 = 0.1;
+/// Radios tell their state at 1 Hz.
+const RADIO_SILENCE: SignedDuration = SignedDuration::from_secs(10);
 
 fn text(fire: FireId, alarm: &Alarm, now: ServiceTime) -> StatusText {
     let properties = &alarm.properties;
@@ -655,6 +748,21 @@ mod tests {
 
     fn delivery() -> MavlinkDelivery {
         MavlinkDelivery::new(MavlinkSettings::new(OWN))
+    }
+
+    /// The receipt that comes of it.
+    fn observe(
+        delivery: &mut MavlinkDelivery,
+        from: Address,
+        telemetry: &Telemetry,
+        now: ServiceTime,
+    ) -> Option<Receipt> {
+        delivery.observe(from, telemetry, now);
+        let settled = std::mem::take(&mut delivery.settled);
+        settled.into_iter().find_map(|settled| match settled {
+            Settled::Delivered(receipt) => Some(receipt),
+            _ => None,
+        })
     }
 
     struct Sent {
@@ -739,7 +847,12 @@ mod tests {
             .map(|(at_s, ..)| *at_s)
             .collect();
         assert_eq!(times, [0.0, 1.0, 3.0, 7.0, 15.0, 31.0, 61.0, 91.0]);
-        let receipt = delivery.observe(GROUND, &ack(7, 1, CommandResult::Accepted), after_s(100.0));
+        let receipt = observe(
+            &mut delivery,
+            GROUND,
+            &ack(7, 1, CommandResult::Accepted),
+            after_s(100.0),
+        );
         assert_eq!(
             receipt,
             Some(Receipt {
@@ -756,7 +869,12 @@ mod tests {
         let mut delivery = delivery();
         delivery.offer(&alarm(7, 1)).unwrap();
         run(&mut delivery, 0.0, 0.01);
-        delivery.observe(GROUND, &ack(7, 1, CommandResult::Accepted), after_s(0.02));
+        observe(
+            &mut delivery,
+            GROUND,
+            &ack(7, 1, CommandResult::Accepted),
+            after_s(0.02),
+        );
         assert_eq!(texts(&run(&mut delivery, 0.02, 10.0)).len(), 1);
     }
 
@@ -807,13 +925,22 @@ mod tests {
         delivery.offer(&alarm(2, 1)).unwrap();
         run(&mut delivery, 0.0, 0.6);
         assert_eq!(
-            delivery.observe(GROUND, &ack(1, 1, CommandResult::Denied), after_s(0.7)),
+            observe(
+                &mut delivery,
+                GROUND,
+                &ack(1, 1, CommandResult::Denied),
+                after_s(0.7)
+            ),
             None
         );
         assert!(
-            delivery
-                .observe(GROUND, &ack(2, 1, CommandResult::Accepted), after_s(0.7))
-                .is_some()
+            observe(
+                &mut delivery,
+                GROUND,
+                &ack(2, 1, CommandResult::Accepted),
+                after_s(0.7)
+            )
+            .is_some()
         );
         assert_eq!((delivery.waiting(), delivery.counters().refused), (1, 1));
         let again = commands(&run(&mut delivery, 0.7, 100.0));
@@ -835,7 +962,7 @@ mod tests {
             on_the_way = wait;
             for (_, fire) in come {
                 let accepted = ack(fire.0, 1, CommandResult::Accepted);
-                delivery.observe(GROUND, &accepted, after_s(now_s));
+                observe(&mut delivery, GROUND, &accepted, after_s(now_s));
             }
         }
         assert_eq!(
@@ -863,13 +990,23 @@ mod tests {
         delivery.offer(&alarm(7, 1)).unwrap();
         run(&mut delivery, 0.0, 0.5);
         delivery.offer(&alarm(7, 2)).unwrap();
-        let late = delivery.observe(GROUND, &ack(7, 1, CommandResult::Accepted), after_s(0.6));
+        let late = observe(
+            &mut delivery,
+            GROUND,
+            &ack(7, 1, CommandResult::Accepted),
+            after_s(0.6),
+        );
         assert_eq!((late, delivery.counters().stray_answers), (None, 1));
         assert_eq!(
             commands(&run(&mut delivery, 0.6, 2.0)),
             [(1.0, FireId(7), 2)]
         );
-        let receipt = delivery.observe(GROUND, &ack(7, 2, CommandResult::Accepted), after_s(2.0));
+        let receipt = observe(
+            &mut delivery,
+            GROUND,
+            &ack(7, 2, CommandResult::Accepted),
+            after_s(2.0),
+        );
         assert_eq!(receipt.map(|receipt| receipt.revision), Some(2));
     }
 
@@ -879,7 +1016,12 @@ mod tests {
         delivery.offer(&alarm(7, 1)).unwrap();
         run(&mut delivery, 0.0, 0.5);
         let accepted = ack(7, 1, CommandResult::Accepted);
-        let stranger = delivery.observe(Address::new(255, 190), &accepted, after_s(0.6));
+        let stranger = observe(
+            &mut delivery,
+            Address::new(255, 190),
+            &accepted,
+            after_s(0.6),
+        );
         assert_eq!((stranger, delivery.waiting()), (None, 1));
     }
 
@@ -891,7 +1033,7 @@ mod tests {
         let heartbeat = emberfix_mav::outgoing::companion_heartbeat(true);
         let bytes = Encoder::new(GROUND).encode(&heartbeat);
         let heartbeat = decode(&RawFrame::at_start(&bytes).unwrap().0).unwrap();
-        delivery.observe(GROUND, &heartbeat, after_s(70.0));
+        observe(&mut delivery, GROUND, &heartbeat, after_s(70.0));
         assert_eq!(commands(&run(&mut delivery, 70.0, 72.0)).len(), 1);
     }
 
@@ -904,7 +1046,8 @@ mod tests {
         delivery.offer(&alarm(2, 1)).unwrap();
         for number in [1, 2] {
             run(&mut delivery, f64::from(number), f64::from(number) + 1.0);
-            delivery.observe(
+            observe(
+                &mut delivery,
                 GROUND,
                 &ack(number, 1, CommandResult::Accepted),
                 after_s(f64::from(number) + 1.0),
@@ -928,7 +1071,12 @@ mod tests {
         let mut delivery = delivery();
         delivery.offer(&alarm(7, 1)).unwrap();
         run(&mut delivery, 0.0, 10.0);
-        delivery.observe(GROUND, &ack(7, 1, CommandResult::Accepted), after_s(10.0));
+        observe(
+            &mut delivery,
+            GROUND,
+            &ack(7, 1, CommandResult::Accepted),
+            after_s(10.0),
+        );
         let mut out = alarm(7, 2);
         out.properties.state = FireState::Out;
         delivery.offer(&out).unwrap();
@@ -974,11 +1122,62 @@ mod tests {
             })
         );
         let first = commands(&run(&mut delivery, 0.0, 0.5))[0].1;
-        delivery.observe(
+        observe(
+            &mut delivery,
             GROUND,
             &ack(first.0, 1, CommandResult::Accepted),
             after_s(0.6),
         );
         assert_eq!(delivery.offer(&alarm(limit + 1, 1)), Ok(()));
+    }
+
+    fn radio(free_buffer_percent: u8) -> Telemetry {
+        Telemetry::RadioStatus(emberfix_mav::telemetry::RadioStatus {
+            rssi: None,
+            remote_rssi: None,
+            free_buffer_percent,
+            receive_errors: 0,
+        })
+    }
+
+    #[test]
+    fn a_radio_whose_buffer_fills_slows_us_and_an_empty_one_lets_us_go_on() {
+        const RADIO: Address = Address::new(51, 68);
+        let sent_in_a_minute = |free: Option<u8>| {
+            let mut delivery = delivery();
+            for number in 1..=100 {
+                delivery.offer(&alarm(number, 1)).unwrap();
+            }
+            run(&mut delivery, 0.0, 10.0);
+            let mut bytes = 0;
+            for second in 10..70 {
+                let from_s = f64::from(second);
+                if let Some(free) = free {
+                    observe(&mut delivery, RADIO, &radio(free), after_s(from_s));
+                }
+                let sent = run(&mut delivery, from_s, from_s + 1.0);
+                bytes += sent.iter().map(|sent| sent.bytes).sum::<usize>();
+            }
+            bytes
+        };
+        let (free, full) = (sent_in_a_minute(Some(100)), sent_in_a_minute(Some(10)));
+        assert_eq!(free, sent_in_a_minute(None));
+        assert!(full < free / 5 && full > 400, "{full} of {free} bytes");
+    }
+
+    #[test]
+    fn what_an_operator_has_seen_is_not_repeated_and_what_was_dismissed_not_shown() {
+        let said = |attention| {
+            let mut delivery = delivery();
+            delivery.offer(&alarm(7, 1)).unwrap();
+            let mut sent = run(&mut delivery, 0.0, 0.5);
+            delivery.attend(|_| attention);
+            sent.extend(run(&mut delivery, 0.5, 20.0));
+            let camera = |sent: &&Sent| matches!(sent.says, Telemetry::CameraTrackingGeoStatus(_));
+            (texts(&sent).len(), sent.iter().filter(camera).count() > 3)
+        };
+        assert_eq!(said(Attention::Wanted), (3, true));
+        assert_eq!(said(Attention::Seen), (1, true));
+        assert_eq!(said(Attention::Dismissed), (1, false));
     }
 }

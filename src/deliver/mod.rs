@@ -5,7 +5,7 @@
 //! **In.** [`crate::alarm::Alarm`]s, and telemetry of the ground agent (its `COMMAND_ACK`s).
 //! **Out.** Over MAVLink, as messages for the pipeline's one connection ([`mavlink`], sans-IO):
 //! STATUSTEXT and CAMERA_TRACKING_GEO_STATUS for stock ground stations, COMMAND_INT for our ground
-//! agent ([`spatial`]). Over links that answer at once ([`AlarmLink`], such as HTTP): whole alarms.
+//! agent ([`spatial`]). Over IP: whole alarms. All are [`AlarmLink`]s, held to one contract.
 //!
 //! **The way of one alarm.** [`Outbox::put`] (on disk) -> [`Outbox::pending`] per link, urgent first
 //! -> the link -> its receipt -> [`Outbox::acknowledge`] (on disk). At least once, per link; the
@@ -21,18 +21,33 @@
 //!
 //! **Assumptions.** One service per outbox. Time is an argument; nothing here reads a clock.
 //!
-//! **Known limits.** MAVLink frames are not signed yet: whoever is on the link can acknowledge.
+//! **Signatures.** Every alarm goes in one signed envelope, the same over each link that carries whole
+//! alarms ([`envelope`], [`keys`]); what MAVLink carries is a summary, guarded by MAVLink's own signing.
+//!
+//! **Ways over IP**, one link in the outbox: datagrams ([`datagram`]), and HTTP ([`lanes`]) for what fits
+//! into none, or where no datagram gets through.
 
+pub mod datagram;
+pub mod envelope;
 pub mod http;
+pub mod keys;
+pub mod lanes;
 pub mod link;
 pub mod mavlink;
+pub mod orders;
 pub mod outbox;
+pub mod signing_file;
 pub mod spatial;
 
+#[cfg(test)]
+mod contract;
+
+pub use datagram::{DatagramDelivery, DatagramSettings};
 pub use http::{HttpError, HttpLink};
-pub use link::{AlarmLink, Courier, LinkError, Receipt, Urgency};
+pub use lanes::HttpLanes;
+pub use link::{AlarmLink, Courier, Letter, Receipt, Settled, Urgency};
 pub use mavlink::{MavlinkDelivery, MavlinkSettings};
-pub use outbox::{Outbox, OutboxError, Put};
+pub use outbox::{Outbox, OutboxError, Owner, Put};
 
 use crate::alarm::FireId;
 use emberfix_mav::SystemId;

@@ -1,8 +1,11 @@
 //! An alarm to test with.
 
 use super::alarm_id;
-use crate::alarm::{Alarm, AlarmClass, AlarmProperties, FireId, FireState, Method};
+use super::envelope::{Envelope, Origin, Sealed};
+use super::link::Letter;
+use crate::alarm::{Alarm, AlarmClass, AlarmProperties, Attention, FireId, FireState, Method};
 use emberfix_frames::{EllipsoidHeight, ServiceTime, place_from_degrees};
+use std::sync::Arc;
 
 /// A confirmed fire at Gaochun, of aircraft `uav-1`.
 pub(super) fn alarm(number: u32, revision: u32) -> Alarm {
@@ -33,5 +36,39 @@ pub(super) fn alarm(number: u32, revision: u32) -> Alarm {
             burning: Default::default(),
             degraded: Vec::new(),
         },
+    }
+}
+
+/// The alarm as a letter, unsigned; its sequence is 1000 times the fire's number plus the revision.
+pub(super) fn letter(number: u32, revision: u32) -> Letter {
+    sealed(alarm(number, revision))
+}
+
+/// Likewise, in another state.
+pub(super) fn letter_in(number: u32, revision: u32, state: FireState) -> Letter {
+    let mut alarm = alarm(number, revision);
+    alarm.properties.state = state;
+    sealed(alarm)
+}
+
+fn sealed(alarm: Alarm) -> Letter {
+    let properties = &alarm.properties;
+    let number = super::fire_number(&properties.id).unwrap().0;
+    let envelope = Envelope {
+        origin: Origin {
+            uav: "uav-1".to_owned(),
+            outbox: 7,
+        },
+        sequence: u64::from(number) * 1_000 + u64::from(properties.revision),
+        count: properties.revision,
+        alarm: alarm.to_geojson().to_string().into_bytes(),
+    };
+    Letter {
+        alarm: Arc::new(alarm),
+        sealed: Arc::new(Sealed {
+            envelope,
+            signature: None,
+        }),
+        attention: Attention::Wanted,
     }
 }

@@ -8,6 +8,8 @@
 
 pub mod boresight;
 pub mod calibration;
+pub mod delivery;
+pub mod ground;
 pub mod location;
 pub mod range;
 pub mod trend;

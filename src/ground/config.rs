@@ -1,9 +1,12 @@
 //! The ground station's configuration file: raw TOML to a checked [`GroundConfig`], every problem
 //! at once.
 
+use super::doors::{self, Doors, RawDoors};
+use super::receive::Keyring;
 use super::screens::config::{self as screens, RawScreens, ScreensConfig};
+use crate::deliver::keys::PublicKey;
 use emberfix_calib::{KeyProblem, toml_problem, unknown_keys};
-use emberfix_mav::{LinkUrl, LinkUrlError};
+use emberfix_mav::{LinkUrl, LinkUrlError, SigningKey};
 use serde::Deserialize;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -61,6 +64,16 @@ pub struct GroundConfig {
     pub(super) mavlink: Option<MavlinkConfig>,
     pub(super) uavs: Vec<Uav>,
     pub(super) screens: ScreensConfig,
+    pub(super) doors: Doors,
+    pub(super) datagrams: bool,
+}
+
+impl GroundConfig {
+    /// Whose word counts.
+    pub(super) fn keyring(&self) -> Keyring {
+        let named = |uav: &Uav| (uav.name.clone(), uav.public_key);
+        Keyring::new(self.uavs.iter().map(named))
+    }
 }
 
 /// The ground agent's end of MAVLink.
@@ -69,6 +82,7 @@ pub(super) struct MavlinkConfig {
     pub url: LinkUrl,
     pub system_id: u8,
     pub component_id: u8,
+    pub signing_key: Option<SigningKey>,
 }
 
 /// Which aircraft flies under which MAVLink system id.
@@ -76,14 +90,14 @@ pub(super) struct MavlinkConfig {
 pub(super) struct Uav {
     pub system_id: u8,
     pub name: String,
+    pub public_key: Option<PublicKey>,
 }
 
 #[derive(Deserialize)]
 struct RawConfig {
     #[serde(default = "default_listen")]
     listen: String,
-    #[serde(default)]
-    allow_remote: bool,
+    allow_remote: Option<bool>,
     #[serde(default)]
     host_names: Vec<String>,
     data_dir: PathBuf,
@@ -94,6 +108,14 @@ struct RawConfig {
     uav: Vec<RawUav>,
     #[serde(flatten)]
     screens: RawScreens,
+    #[serde(flatten)]
+    doors: RawDoors,
+    #[serde(default = "yes")]
+    datagrams: bool,
+}
+
+fn yes() -> bool {
+    true
 }
 
 #[derive(Deserialize)]
@@ -103,12 +125,25 @@ struct RawMavlink {
     system_id: i64,
     #[serde(default = "default_component_id")]
     component_id: i64,
+    signing_key: Option<PathBuf>,
+}
+
+impl RawMavlink {
+    fn usual() -> Self {
+        Self {
+            url: String::new(),
+            system_id: default_system_id(),
+            component_id: default_component_id(),
+            signing_key: None,
+        }
+    }
 }
 
 #[derive(Deserialize)]
 struct RawUav {
     system_id: i64,
     name: String,
+    public_key: Option<String>,
 }
 
 fn default_listen() -> String {
@@ -132,8 +167,11 @@ const KNOWN: &[&str] = &[
     "mavlink.url",
     "mavlink.system_id",
     "mavlink.component_id",
+    "mavlink.signing_key",
+    "datagrams",
     "uav.system_id",
     "uav.name",
+    "uav.public_key",
 ];
 
 impl GroundConfig {
@@ -166,7 +204,8 @@ impl GroundConfig {
             })
         };
         let table: toml::Table = toml::from_str(text).map_err(syntax)?;
-        let mut problems: Vec<String> = unknown_keys(&table, &[KNOWN, screens::KNOWN].concat())
+        let known = [KNOWN, screens::KNOWN, doors::KNOWN].concat();
+        let mut problems: Vec<String> = unknown_keys(&table, &known)
             .iter()
             .map(KeyProblem::to_string)
             .collect();
@@ -191,23 +230,23 @@ fn check(
     problems: &mut Vec<String>,
 ) -> Option<GroundConfig> {
     let listen = overrides.listen.or_else(|| address(&raw.listen, problems));
-    if let Some(address) = listen {
-        check_door(address, raw.allow_remote, problems);
-    }
     let folder = path.parent().unwrap_or(Path::new(""));
+    let doors = raw.doors.check(folder, problems);
+    if let Some(address) = listen {
+        doors.check_address(address, problems);
+    }
+    if raw.allow_remote.is_some() {
+        problems.push(
+            "allow_remote is no longer read: beyond this machine the station needs [tls] and [[access]]"
+                .to_owned(),
+        );
+    }
     let mut mavlink = raw.mavlink;
     if let Some(url) = overrides.mavlink_url {
-        let (system_id, component_id) = mavlink.map_or_else(
-            || (default_system_id(), default_component_id()),
-            |given| (given.system_id, given.component_id),
-        );
-        mavlink = Some(RawMavlink {
-            url,
-            system_id,
-            component_id,
-        });
+        let given = mavlink.unwrap_or_else(RawMavlink::usual);
+        mavlink = Some(RawMavlink { url, ..given });
     }
-    let mavlink = mavlink.and_then(|link| check_mavlink(link, problems));
+    let mavlink = mavlink.and_then(|link| check_mavlink(link, folder, problems));
     let uavs = check_uavs(&raw.uav, problems);
     let vehicle = mavlink.as_ref().map(|link| &link.url);
     let screens = raw.screens.check(folder, vehicle, problems);
@@ -221,6 +260,8 @@ fn check(
         mavlink,
         uavs,
         screens,
+        doors,
+        datagrams: raw.datagrams,
     })
 }
 
@@ -234,17 +275,15 @@ fn address(text: &str, problems: &mut Vec<String>) -> Option<SocketAddr> {
     parsed
 }
 
-/// Whoever reaches the address may post alarms, so by default only this machine may.
-fn check_door(address: SocketAddr, allow_remote: bool, problems: &mut Vec<String>) {
-    if !address.ip().is_loopback() && !allow_remote {
-        problems.push(format!(
-            "listen is {address}, allowed is a loopback address: anyone who reaches it could post \
-             alarms; set allow_remote = true when the network itself is guarded (a VPN)"
-        ));
-    }
-}
-
-fn check_mavlink(raw: RawMavlink, problems: &mut Vec<String>) -> Option<MavlinkConfig> {
+fn check_mavlink(
+    raw: RawMavlink,
+    folder: &Path,
+    problems: &mut Vec<String>,
+) -> Option<MavlinkConfig> {
+    let signing_key = raw.signing_key.map(|path| {
+        crate::mission::load_signing_key(&folder.join(path))
+            .map_err(|problem| problems.push(format!("mavlink.signing_key: {problem}")))
+    });
     let system_id = id("mavlink.system_id", raw.system_id, problems);
     let component_id = id("mavlink.component_id", raw.component_id, problems);
     let url = raw
@@ -256,6 +295,7 @@ fn check_mavlink(raw: RawMavlink, problems: &mut Vec<String>) -> Option<MavlinkC
         url: url?,
         system_id: system_id?,
         component_id: component_id?,
+        signing_key: signing_key.transpose().ok()?,
     })
 }
 
@@ -288,9 +328,15 @@ fn check_uavs(raw: &[RawUav], problems: &mut Vec<String>) -> Vec<Uav> {
                 uav.name
             ));
         }
+        let public_key = uav.public_key.as_deref().map(str::parse).transpose();
+        let public_key = public_key.unwrap_or_else(|error| {
+            problems.push(format!("uav.public_key of {:?}: {error}", uav.name));
+            None
+        });
         uavs.push(Uav {
             system_id,
             name: uav.name.clone(),
+            public_key,
         });
     }
     uavs
@@ -321,7 +367,7 @@ mod tests {
         for part in [
             "conf/ground.toml",
             "did you mean listen",
-            "allow_remote = true",
+            "[[access]]",
             "1 to 255",
             "uav.system_id is 0",
         ] {
@@ -348,6 +394,31 @@ mod tests {
         };
         let refused = GroundConfig::parse("data_dir='d'", Path::new("g.toml"), overrides);
         assert!(matches!(refused, Err(ConfigError::Values { .. })));
-        assert!(parse("data_dir='d'\nlisten='0.0.0.0:8470'\nallow_remote=true").is_ok());
+        let allowed = parse("data_dir='d'\nlisten='0.0.0.0:8470'\nallow_remote=true").unwrap_err();
+        assert!(allowed.contains("no longer read") && allowed.contains("ground-remote.toml"));
+    }
+
+    #[test]
+    fn every_problem_of_the_doors_is_named_at_once() {
+        let text = "data_dir='d'\nlisten='0.0.0.0:1'\nstore='mysql://x:secret@y'\n\
+                    [tls]\ncertificate='no.pem'\nkey='no.key'\n\
+                    [[access]]\nname='a'\nrole='king'\ntoken_sha256='12'\n\
+                    [limits]\nconnections=0\nhead_s=nan\n\
+                    [bus]\nurl='http://x'\nstation='a b'\nreplicas=9";
+        let message = parse(text).unwrap_err();
+        for part in [
+            "tls.certificate conf/no.pem",
+            "\"king\", allowed are aircraft, screen, operator",
+            "64 hexadecimal digits",
+            "store is no PostgreSQL address",
+            "limits.connections is 0",
+            "limits.head_s is NaN",
+            "bus.url is \"http://x\"",
+            "bus.station is \"a b\"",
+            "bus.replicas is 9",
+        ] {
+            assert!(message.contains(part), "{part:?} is not in {message}");
+        }
+        assert!(!message.contains("secret"), "{message}");
     }
 }

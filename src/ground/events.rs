@@ -227,6 +227,10 @@ impl Stream {
                 let event = self.place.0.texts.event(news);
                 self.tell(event).await?;
             }
+            // What changes meanwhile is told in the next round: a busy ground must not run this for ever.
+            if after >= until {
+                break;
+            }
         }
         after = after.max(until);
         self.cursor = Cursor::Incidents { after };

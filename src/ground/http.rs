@@ -6,11 +6,13 @@
 
 mod incidents;
 
+use super::access::{self, Access, Caller, Doorkeeper};
 use super::events::{self, MAX_STREAMS, Show};
-use super::store::{Completeness, Kept, StoreError};
+use super::store::{Kept, StoreError};
 use super::tracks::Source;
 use super::{Ping, ReceiveError, Station, lock, now};
-use axum::Router;
+use crate::deliver::envelope;
+use crate::deliver::http::{RECEIPT_HEADER, WIRE_KIND};
 use axum::body::Bytes;
 use axum::extract::rejection::BytesRejection;
 use axum::extract::{DefaultBodyLimit, Query, Request, State};
@@ -19,6 +21,7 @@ use axum::middleware::{self, Next};
 use axum::response::sse::{KeepAlive, Sse};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
+use axum::{Extension, Router};
 use serde::Deserialize;
 use serde_json::json;
 use std::net::IpAddr;
@@ -37,12 +40,19 @@ const PAGE: u32 = 512;
 
 type Shared = State<Arc<Station>>;
 
-pub(super) fn router(station: Arc<Station>, host_names: Arc<[String]>) -> Router {
+pub(super) fn router(
+    station: Arc<Station>,
+    host_names: Arc<[String]>,
+    accesses: Vec<Access>,
+) -> Router {
+    let keeper = Arc::new(Doorkeeper::new(accesses));
+    let counting = Arc::clone(&station);
     Router::new()
         .merge(super::page::routes())
         .merge(super::screens::routes())
         .route("/alarms", post(post_alarm))
         .route("/alarms/test", post(post_test))
+        .route("/wire", post(post_wire))
         .route("/alarms.geojson", get(alarms))
         .route("/incidents.geojson", get(incidents::collection))
         .route("/incidents/changes", get(incidents::changes))
@@ -59,12 +69,61 @@ pub(super) fn router(station: Arc<Station>, host_names: Arc<[String]>) -> Router
         .with_state(station)
         .layer(DefaultBodyLimit::max(MAX_BODY))
         .layer(middleware::from_fn(in_time))
+        .layer(middleware::from_fn_with_state(Arc::clone(&counting), small))
+        .layer(middleware::from_fn_with_state(keeper, access::admit))
         .layer(middleware::from_fn_with_state(host_names, only_for_us))
         .layer(middleware::map_response(guarded))
+        .layer(middleware::from_fn_with_state(counting, count_refusals))
+}
+
+/// What was refused, by status, for `/health`.
+async fn count_refusals(State(station): Shared, request: Request, next: Next) -> Response {
+    let response = next.run(request).await;
+    let status = response.status();
+    if status.is_client_error() || status.is_server_error() {
+        *lock(&station.refusals).entry(status.as_u16()).or_default() += 1;
+    }
+    response
+}
+
+/// Refuses an aircraft that speaks in another's name.
+fn speaks(caller: &Caller, body: &[u8]) -> Option<Response> {
+    #[derive(Deserialize)]
+    struct Named {
+        uav: String,
+    }
+    #[derive(Deserialize)]
+    struct Alarm {
+        properties: Named,
+    }
+    let Caller::Known(access) = caller else {
+        return None;
+    };
+    let alarm = serde_json::from_slice::<Alarm>(body).map(|alarm| alarm.properties);
+    let named = alarm.or_else(|_| serde_json::from_slice::<Named>(body));
+    match named {
+        // What names nobody is refused where it is read.
+        Ok(named) if !caller.speaks_for(&named.uav) => {
+            let reason = format!("{} does not speak for {:?}", access.name, named.uav);
+            Some(refusal(StatusCode::FORBIDDEN, reason))
+        }
+        _ => None,
+    }
 }
 
 pub(super) fn refusal(status: StatusCode, reason: impl std::fmt::Display) -> Response {
     (status, axum::Json(json!({ "error": reason.to_string() }))).into_response()
+}
+
+/// Refuses a body by the size that it announces, before any of it is waited for.
+async fn small(State(station): Shared, request: Request, next: Next) -> Response {
+    let announced = request.headers().get(header::CONTENT_LENGTH);
+    let announced = announced.and_then(|length| length.to_str().ok()?.parse::<u64>().ok());
+    if announced.is_some_and(|length| length > MAX_BODY as u64) {
+        station.refuse(&BodyError::Large, LINK_NAME);
+        return BodyError::Large.answer();
+    }
+    next.run(request).await
 }
 
 /// A handler that has not answered in time is dropped.
@@ -181,6 +240,7 @@ fn json_body(headers: &HeaderMap, body: Result<Bytes, BytesRejection>) -> Result
 
 async fn post_alarm(
     State(station): Shared,
+    Extension(caller): Extension<Caller>,
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Response {
@@ -191,7 +251,14 @@ async fn post_alarm(
             return error.answer();
         }
     };
-    let (alarm, kept) = match station.receive(&body, LINK_NAME, Completeness::Full).await {
+    if let Some(refused) = speaks(&caller, &body) {
+        return refused;
+    }
+    let header = headers
+        .get(envelope::HTTP_HEADER)
+        .and_then(|h| h.to_str().ok());
+    let received = station.reception.http(&station, header, &body, LINK_NAME);
+    let (alarm, kept, signed) = match received.await {
         Ok(received) => received,
         Err(error) => return not_taken(&error),
     };
@@ -201,12 +268,39 @@ async fn post_alarm(
     };
     let properties = alarm.properties;
     let receipt = json!({ "id": properties.id, "revision": properties.revision, "stored": true });
-    (status, axum::Json(receipt)).into_response()
+    let signed = signed.and_then(|signed| HeaderValue::from_str(&signed).ok());
+    let signed = signed.map(|signed| [(HeaderName::from_static(RECEIPT_HEADER), signed)]);
+    (status, signed, axum::Json(receipt)).into_response()
+}
+
+/// One datagram of the wire, and its answer, for aircraft that no datagram leaves.
+///
+/// Its kind is one that a foreign page can't send unasked.
+async fn post_wire(
+    State(station): Shared,
+    headers: HeaderMap,
+    body: Result<Bytes, BytesRejection>,
+) -> Response {
+    let kind = headers.get(header::CONTENT_TYPE);
+    let answer = match body {
+        Ok(body) if kind.is_some_and(|kind| kind == WIRE_KIND) => {
+            station.reception.datagram(&station, &body).await
+        }
+        _ => None,
+    };
+    match answer {
+        Some(answer) => ([(header::CONTENT_TYPE, WIRE_KIND)], answer).into_response(),
+        None => refusal(
+            StatusCode::BAD_REQUEST,
+            "no datagram that this station answers",
+        ),
+    }
 }
 
 /// An alarm that is only a test: checked as a real one and shown as a test, kept nowhere.
 async fn post_test(
     State(station): Shared,
+    Extension(caller): Extension<Caller>,
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Response {
@@ -214,6 +308,9 @@ async fn post_test(
         Ok(body) => body,
         Err(error) => return error.answer(),
     };
+    if let Some(refused) = speaks(&caller, &body) {
+        return refused;
+    }
     match station.test(&body, LINK_NAME) {
         Ok(alarm) => {
             let properties = alarm.properties;
@@ -227,15 +324,19 @@ async fn post_test(
 
 fn not_taken(error: &ReceiveError) -> Response {
     let status = match error {
-        ReceiveError::Alarm(_) | ReceiveError::Covariance { .. } => StatusCode::BAD_REQUEST,
+        ReceiveError::Alarm(_) | ReceiveError::Covariance { .. } | ReceiveError::Envelope(_) => {
+            StatusCode::BAD_REQUEST
+        }
+        ReceiveError::Trust(_) => StatusCode::FORBIDDEN,
         ReceiveError::Store(StoreError::Conflict { .. }) => StatusCode::CONFLICT,
-        ReceiveError::Store(_) => StatusCode::SERVICE_UNAVAILABLE,
+        ReceiveError::Store(_) | ReceiveError::Ledger(_) => StatusCode::SERVICE_UNAVAILABLE,
     };
     refusal(status, error)
 }
 
 async fn post_track(
     State(station): Shared,
+    Extension(caller): Extension<Caller>,
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Response {
@@ -243,6 +344,9 @@ async fn post_track(
         Ok(body) => body,
         Err(error) => return error.answer(),
     };
+    if let Some(refused) = speaks(&caller, &body) {
+        return refused;
+    }
     match Ping::from_json(&body).and_then(|ping| station.moved(ping, Source::Service)) {
         Ok(()) => StatusCode::NO_CONTENT.into_response(),
         Err(error) => refusal(StatusCode::BAD_REQUEST, error),
@@ -322,6 +426,7 @@ async fn health(State(station): Shared) -> Response {
         "status": "ok",
         "version": env!("CARGO_PKG_VERSION"),
         "now": now().rfc3339(),
+        "wire": station.reception.health(),
         "store": station.store.id(),
         "incidents": census.incidents,
         "alarms": census.alarms,
@@ -333,6 +438,9 @@ async fn health(State(station): Shared) -> Response {
         "waiting": station.writer.waiting(),
         "streams": counters.streams.load(Ordering::Relaxed),
         "mavlink": mavlink,
+        "bus": station.bus,
+        "turned_away": &*station.turned,
+        "refused_by_status": lock(&station.refusals).clone(),
         "aircraft": aircraft,
     }))
     .into_response()

@@ -3,6 +3,7 @@
 use super::blocks::{BlockReader, RawMessage};
 use super::messages::{self, Refusal, Role, StatedCalibration};
 use super::{PairAssembler, SPECTRA, StereoPair, StreamCounters, note};
+use crate::alarm::Action;
 use crate::assess::spectrum::Spectrum;
 use bytes::Bytes;
 use emberfix_calib::Eye;
@@ -20,6 +21,13 @@ pub enum StreamEvent {
         arrived: ServiceTime,
         /// The frame.
         bytes: Bytes,
+    },
+    /// What an operator did about an alarm.
+    Action {
+        /// When it arrived.
+        arrived: ServiceTime,
+        /// What was done.
+        action: Action,
     },
     /// An eye's calibration as the sender has it.
     Calibration {
@@ -103,6 +111,12 @@ impl MessageReader {
                 });
             }
             Role::Mavlink => return Err(Refusal::Unreadable),
+            Role::Action => {
+                let action = serde_json::from_slice(&message.data);
+                let action = action.map_err(|_| Refusal::Unreadable)?;
+                self.counters.actions += 1;
+                events.push_back(StreamEvent::Action { arrived, action });
+            }
             Role::Spectrometer => {
                 let spectrum = messages::spectrum(message)?;
                 self.counters.spectrometer += 1;

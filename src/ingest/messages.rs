@@ -17,6 +17,7 @@ pub(crate) mod topic {
     pub const RIGHT_CALIBRATION: &str = "/stereo/right/calibration";
     pub const MAVLINK: &str = "/mavlink/raw";
     pub const SPECTROMETER: &str = "/spectrometer";
+    pub const ACTIONS: &str = "/operator/actions";
 }
 
 /// What a message is to us, in the order in which messages of one log time count.
@@ -24,6 +25,7 @@ pub(crate) mod topic {
 pub(crate) enum Role {
     Calibration(EyeRank),
     Mavlink,
+    Action,
     Spectrometer,
     Image(EyeRank),
     Other,
@@ -54,6 +56,7 @@ impl Role {
             topic::RIGHT_CALIBRATION => Self::Calibration(EyeRank::Right),
             topic::MAVLINK => Self::Mavlink,
             topic::SPECTROMETER => Self::Spectrometer,
+            topic::ACTIONS => Self::Action,
             _ => Self::Other,
         }
     }

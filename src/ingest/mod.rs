@@ -186,6 +186,8 @@ pub struct StreamCounters {
     pub calibrations: u64,
     /// MAVLink frames.
     pub mavlink: u64,
+    /// Operators' actions.
+    pub actions: u64,
     /// Spectrometer readings.
     pub spectrometer: u64,
     /// Spectrometer readings that newer ones pushed out before a pair came: dropped.

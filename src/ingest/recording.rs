@@ -11,6 +11,7 @@ use super::{
     PairAssembler, SourceCounters, SourceError, StereoPair, StereoSource, StreamCounters,
     StreamEvent,
 };
+use crate::alarm::Action;
 use bytes::Bytes;
 use emberfix_calib::{Eye, Rig};
 use emberfix_frames::{ServiceTime, Stamped};
@@ -35,6 +36,13 @@ pub enum Recorded {
         arrived: ServiceTime,
         /// The bytes as they came.
         bytes: Bytes,
+    },
+    /// What an operator did about an alarm.
+    Action {
+        /// When it arrived.
+        arrived: ServiceTime,
+        /// What was done.
+        action: Action,
     },
     /// A pair; `value.arrived` is when it was complete.
     Pair(Stamped<StereoPair>),
@@ -167,6 +175,7 @@ impl From<StreamEvent> for Recorded {
         match event {
             StreamEvent::Pair(pair) => Self::Pair(pair),
             StreamEvent::Mavlink { arrived, bytes } => Self::Mavlink { arrived, bytes },
+            StreamEvent::Action { arrived, action } => Self::Action { arrived, action },
             StreamEvent::Calibration {
                 arrived,
                 eye,

@@ -198,7 +198,8 @@ impl Intake {
         while let Some(event) = self.stream.pop() {
             match event {
                 StreamEvent::Pair(pair) => producer.slot.put(pair),
-                StreamEvent::Mavlink { .. } => {} // counted by the stream
+                // Counted by the stream.
+                StreamEvent::Mavlink { .. } | StreamEvent::Action { .. } => {}
                 StreamEvent::Calibration { eye, stated, .. } => {
                     let Some(cameras) = &self.cameras else {
                         continue;

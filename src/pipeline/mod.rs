@@ -19,7 +19,7 @@ pub use counters::Counters;
 pub use selfcheck::{Fault, SelfCheck};
 pub use vision::{Seen, Vision};
 
-use crate::alarm::{Alarm, AlarmDesk, Area, FireId, Situation};
+use crate::alarm::{Action, Alarm, AlarmDesk, Area, FireId, Situation};
 use crate::assess::extent::{Extent, Wind};
 use crate::assess::watch::{Assessment, Assessor, Light};
 use crate::detect::{Detection, Detector};
@@ -45,6 +45,8 @@ pub enum Event {
     Mavlink(Box<Received>),
     /// A stereo pair.
     Pair(Box<Stamped<StereoPair>>),
+    /// What an operator did about an alarm.
+    Action(Action),
 }
 
 /// One thing that the service found out.
@@ -167,6 +169,11 @@ impl Pipeline {
         match event {
             Event::Mavlink(received) => self.take_mavlink(&received),
             Event::Pair(pair) => self.take_pair(pair),
+            Event::Action(action) => {
+                let ours = self.desk.note(&action);
+                self.counters
+                    .add("operator", if ours { "taken" } else { "not_ours" });
+            }
         }
         self.work_off()
     }

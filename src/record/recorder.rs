@@ -1,7 +1,7 @@
 //! The recording thread, and the service's side of it.
 
 use super::{BodyPose, RecordError, RecordOptions, Tape, UavFix};
-use crate::alarm::Alarm;
+use crate::alarm::{Action, Alarm};
 use crate::detect::Detection;
 use crate::ingest::StereoPair;
 use bytes::Bytes;
@@ -48,6 +48,10 @@ enum Entry {
     Alarm {
         at: ServiceTime,
         alarm: Box<Alarm>,
+    },
+    Action {
+        at: ServiceTime,
+        action: Action,
     },
     Flush,
 }
@@ -196,6 +200,14 @@ impl Recorder {
         });
     }
 
+    /// What an operator did; it is an input of the replay.
+    pub fn write_action(&self, at: ServiceTime, action: &Action) {
+        self.send(Entry::Action {
+            at,
+            action: action.clone(),
+        });
+    }
+
     /// Ends the chunk soon.
     pub fn flush(&self) {
         self.send(Entry::Flush);
@@ -315,6 +327,7 @@ fn write_entry(tape: &mut Tape, entry: Entry) -> Result<(), RecordError> {
         Entry::Detections { at, detections } => tape.write_detections(at, &detections),
         Entry::FixJson { at, fix } => tape.write_fix_json(at, &fix),
         Entry::Alarm { at, alarm } => tape.write_alarm(at, &alarm),
+        Entry::Action { at, action } => tape.write_action(at, &action),
         Entry::Flush => tape.flush(),
     }
 }

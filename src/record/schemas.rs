@@ -119,3 +119,19 @@ pub(super) const FIX: &str = r#"{
     }
   }
 }"#;
+
+/// `/operator/actions`: what a person on the ground did about an alarm.
+pub(super) const ACTION: &str = r#"{
+  "$schema": "https://json-schema.org/draft/2020-12/schema",
+  "title": "emberfix.Action",
+  "description": "What a person on the ground did about an alarm",
+  "type": "object",
+  "required": ["number", "alarm", "kind", "at"],
+  "properties": {
+    "number": {"description": "at the ground station, rising", "type": "integer"},
+    "alarm": {"description": "id of the alarm", "type": "string"},
+    "kind": {"enum": ["acknowledge", "confirm", "dismiss", "merge", "split", "undo"]},
+    "at": {"description": "UTC, RFC 3339, by the ground's clock", "type": "string"},
+    "by": {"type": "string"}
+  }
+}"#;

@@ -2,7 +2,7 @@
 
 use super::convert::{self, ImageMessage};
 use super::{BodyPose, ChunkCompression, RecordError, RecordOptions, UavFix, schemas};
-use crate::alarm::Alarm;
+use crate::alarm::{Action, Alarm};
 use crate::assess::spectrum::Spectrum;
 use crate::detect::Detection;
 use crate::ingest::{EncodedImage, StereoPair};
@@ -38,6 +38,7 @@ const DETECTIONS: &str = "/fire/detections";
 const FIXES: &str = "/fire/fixes";
 const ALARMS: &str = "/fire/alarms";
 const ALARMS_GEOJSON: &str = "/fire/alarms/geojson";
+const ACTIONS: &str = "/operator/actions";
 
 /// A recording being written. See the module for times, durability and topics.
 pub struct Tape {
@@ -262,6 +263,15 @@ impl Tape {
             path: self.path.clone(),
             source,
         })
+    }
+
+    /// What an operator did; the file is synced with the next alarm.
+    ///
+    /// # Errors
+    /// [`RecordError`].
+    pub fn write_action(&mut self, at: ServiceTime, action: &Action) -> Result<(), RecordError> {
+        let value = serde_json::json!(action);
+        self.json(ACTIONS, ("emberfix.Action", schemas::ACTION), &value, at)
     }
 
     /// A reading as it came, before the pair that it belongs to.

@@ -118,7 +118,9 @@ fn replay(path: &Path) -> Vec<Recorded> {
 
 fn arrival(event: &Recorded) -> ServiceTime {
     match event {
-        Recorded::Mavlink { arrived, .. } | Recorded::Calibration { arrived, .. } => *arrived,
+        Recorded::Mavlink { arrived, .. }
+        | Recorded::Action { arrived, .. }
+        | Recorded::Calibration { arrived, .. } => *arrived,
         Recorded::Pair(pair) => pair.value.arrived,
     }
 }
@@ -187,6 +189,7 @@ fn a_replay_recorded_again_is_the_same_replay() {
         match event {
             Recorded::Mavlink { arrived, bytes } => tape.write_mavlink(arrived, &bytes).unwrap(),
             Recorded::Pair(pair) => tape.write_pair(&pair).unwrap(),
+            Recorded::Action { arrived, action } => tape.write_action(arrived, &action).unwrap(),
             Recorded::Calibration { .. } => {} // the tape writes the rig's
         }
     }

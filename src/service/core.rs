@@ -2,7 +2,7 @@
 
 use super::camera::Slot;
 use super::{Board, SharedOutbox, lock};
-use crate::alarm::Alarm;
+use crate::alarm::{Action, Alarm};
 use crate::ground::Ping;
 use crate::ingest::ServiceClock;
 use crate::pipeline::{Event, Output, Pipeline};
@@ -12,6 +12,7 @@ use emberfix_frames::{
     Covariance, ServiceTime, SignedDuration, UnitQuaternion, Wgs84, Wgs84Parts, enu_offset,
 };
 use emberfix_mav::Received;
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::thread::JoinHandle;
@@ -28,6 +29,8 @@ pub enum Input {
     },
     /// The slot holds a pair.
     PairReady,
+    /// An operator acted; it is on disk already.
+    Action(Action),
 }
 
 /// What the thread owns.
@@ -39,7 +42,13 @@ pub struct Core {
     pub clock: ServiceClock,
     pub uav: String,
     pub datum: Wgs84,
+    /// Newest revisions that the disk did not take, by id; at most [`MAX_UNSTORED`].
+    pub unstored: BTreeMap<String, Alarm>,
 }
+
+/// Alarms that wait in memory for a disk that takes nothing. Beyond it the newest are told by the
+/// log alone.
+const MAX_UNSTORED: usize = 1_024;
 
 /// How long the thread sleeps when nothing comes.
 const PATIENCE: Duration = Duration::from_millis(100);
@@ -62,6 +71,7 @@ pub fn start(
                         core.take_mavlink(arrived, received)
                     }
                     Ok(Input::PairReady) => core.take_pair(&slot),
+                    Ok(Input::Action(action)) => core.take_action(action),
                     Err(RecvTimeoutError::Timeout) => {}
                     Err(RecvTimeoutError::Disconnected) => break,
                 }
@@ -101,6 +111,15 @@ impl Core {
         let outputs = self
             .pipeline
             .handle(pair.value.arrived, Event::Pair(Box::new(pair)));
+        self.hand_on(outputs);
+    }
+
+    fn take_action(&mut self, action: Action) {
+        let arrived = self.in_order((self.clock)());
+        if let Some(recorder) = &self.recorder {
+            recorder.write_action(arrived, &action);
+        }
+        let outputs = self.pipeline.handle(arrived, Event::Action(action));
         self.hand_on(outputs);
     }
 
@@ -164,11 +183,8 @@ impl Core {
     }
 
     /// On disk first; only then do the links and the recording hear of it.
-    fn hand_on_alarm(&self, alarm: &Alarm) {
-        let now = (self.clock)();
-        if let Err(error) = lock(&self.outbox).put(alarm, now) {
-            tracing::error!(%error, id = alarm.properties.id, "ALARM NOT STORED");
-        }
+    fn hand_on_alarm(&mut self, alarm: &Alarm) {
+        self.store(alarm);
         tracing::info!(
             id = alarm.properties.id,
             revision = alarm.properties.revision,
@@ -181,8 +197,50 @@ impl Core {
         }
     }
 
+    /// An alarm that the disk does not take is kept in memory, and tried again until it does.
+    fn store(&mut self, alarm: &Alarm) {
+        let id = &alarm.properties.id;
+        let put = lock(&self.outbox).put(alarm, (self.clock)());
+        match put {
+            Ok(_) => {
+                self.unstored.remove(id);
+            }
+            Err(error) => {
+                tracing::error!(%error, id, "ALARM NOT STORED; it is tried again");
+                if self.unstored.len() < MAX_UNSTORED || self.unstored.contains_key(id) {
+                    self.unstored.insert(id.clone(), alarm.clone());
+                }
+            }
+        }
+    }
+
+    fn store_again(&mut self) {
+        for alarm in self.unstored.clone().into_values() {
+            self.store(&alarm);
+        }
+    }
+
+    /// What is wrong with the place where alarms are kept.
+    fn storage_problems(&self) -> Vec<String> {
+        let outbox = lock(&self.outbox);
+        let mut problems = Vec::new();
+        if !self.unstored.is_empty() {
+            let count = self.unstored.len();
+            problems.push(format!("{count} alarms can't be stored: see the disk"));
+        }
+        if outbox.is_on_reserve() {
+            problems.push("the disk is full: alarms use their reserve".to_owned());
+        }
+        if outbox.unreadable() > 0 {
+            problems.push(format!("{} stored alarms are damaged", outbox.unreadable()));
+        }
+        problems
+    }
+
     fn report(&mut self) {
-        let health = self.pipeline.health((self.clock)());
+        self.store_again();
+        let mut health = self.pipeline.health((self.clock)());
+        health.problems.extend(self.storage_problems());
         let mut latest = self.board.latest();
         if health != latest.health {
             for problem in &health.problems {

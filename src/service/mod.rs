@@ -1,8 +1,8 @@
 //! The live service: one thread for the pipeline, one task for MAVLink, one thread for the camera,
-//! one for the ground's HTTP link.
+//! one for the links to the ground over IP.
 //!
 //! ```text
-//! MAVLink task ──telemetry──> pipeline thread ──alarms──> outbox (disk) ──> MAVLink task, HTTP thread
+//! MAVLink task ──telemetry──> pipeline thread ──alarms──> outbox (disk) ──> MAVLink task, courier thread
 //! camera thread ──newest pair──^        └──> recorder
 //! ```
 //!
@@ -15,13 +15,15 @@
 
 mod camera;
 mod core;
-mod courier;
+pub(crate) mod courier;
 mod telemetry;
 
 pub(crate) use telemetry::WANTED;
 
+use crate::deliver::keys::{KeyError, SecretKey};
 use crate::deliver::mavlink::MavlinkDelivery;
-use crate::deliver::{Outbox, OutboxError};
+use crate::deliver::signing_file::{SigningFile, SigningFileError};
+use crate::deliver::{DatagramDelivery, Outbox, OutboxError, Owner};
 use crate::ground::Ping;
 use crate::ingest::{CameraUrl, CameraUrlError, Expected, ServiceClock, SourceError};
 use crate::mission::Mission;
@@ -38,8 +40,7 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 /// Messages that may wait for the pipeline: about a minute of a PX4 onboard link.
 pub const TELEMETRY_QUEUE: usize = 16_384;
 /// The links of the outbox.
-pub const LINKS: [&str; 2] = [MavlinkDelivery::NAME, HTTP];
-pub(crate) const HTTP: &str = "http";
+pub const LINKS: [&str; 2] = [MavlinkDelivery::NAME, DatagramDelivery::NAME];
 
 /// Why the service did not start, or stopped.
 #[derive(Debug, thiserror::Error)]
@@ -59,6 +60,12 @@ pub enum ServiceError {
     /// The outbox can't be opened or written.
     #[error(transparent)]
     Outbox(#[from] OutboxError),
+    /// The key that alarms are signed with can't be had.
+    #[error(transparent)]
+    Key(#[from] KeyError),
+    /// MAVLink signing has no state to go on from.
+    #[error(transparent)]
+    Signing(#[from] SigningFileError),
     /// The recording can't be written.
     #[error(transparent)]
     Record(#[from] RecordError),
@@ -89,6 +96,8 @@ impl ServiceError {
             Self::MavlinkUrl(_) | Self::CameraUrl(_) | Self::GroundUrl(_) => true,
             Self::Camera(error) => error.is_refusal(),
             Self::Mavlink(_)
+            | Self::Key(_)
+            | Self::Signing(_)
             | Self::Outbox(_)
             | Self::Record(_)
             | Self::Folder { .. }
@@ -168,7 +177,18 @@ pub fn open_outbox(mission: &Mission) -> Result<Outbox, ServiceError> {
         path: folder.clone(),
         source,
     })?;
-    Ok(Outbox::open(&folder.join("outbox.sqlite"), &LINKS)?)
+    let key = SecretKey::load_or_make(&mission.key_file())?;
+    // What the ground has to know, said where whoever sets it up looks.
+    eprintln!(
+        "emberfix: this aircraft's public key, for the ground: [[uav]] name = \"{}\" public_key = \"{}\"",
+        mission.uav,
+        key.public()
+    );
+    let owner = Owner {
+        uav: mission.uav.clone(),
+        key: Some(key),
+    };
+    Ok(Outbox::open(&folder.join("outbox.sqlite"), &LINKS, owner)?)
 }
 
 /// Runs until Ctrl-C or SIGTERM.
@@ -186,7 +206,14 @@ pub async fn run(
     let camera_url: CameraUrl = mission.camera_url.parse()?;
     let link = Link::open(&mavlink_url).await?;
     let source = crate::ingest::open(&camera_url, &Expected::of(&mission.rig), Arc::clone(&clock))?;
-    let http = courier::HttpCourier::new(&mission).map_err(ServiceError::GroundUrl)?;
+    let courier = courier::IpCourier::new(
+        &mission.ground,
+        outbox.origin(),
+        outbox.key().cloned(),
+        rand::random(),
+    );
+    let courier = courier.map_err(ServiceError::GroundUrl)?;
+    let signing = open_signing(&mission, &clock)?;
     let recorder = record
         .map(|path| Recorder::create(path, &mission.rig, &RecordOptions::default()))
         .transpose()?;
@@ -206,14 +233,22 @@ pub async fn run(
         clock: Arc::clone(&clock),
         uav: mission.uav.clone(),
         datum: mission.datum,
+        unstored: std::collections::BTreeMap::new(),
     };
     let working = core::start(worker, inbox, slot).map_err(thread_failed)?;
-    let telling = http
-        .map(|http| http.start(Arc::clone(&outbox), Arc::clone(&board), Arc::clone(&clock)))
+    let around = courier::Surroundings {
+        outbox: Arc::clone(&outbox),
+        board: Arc::clone(&board),
+        clock: Arc::clone(&clock),
+        events: Some(events.clone()),
+    };
+    let telling = courier
+        .map(|courier| courier.start(around))
         .transpose()
         .map_err(thread_failed)?;
     let talk = telemetry::Talk::new(
         link,
+        signing,
         &mission,
         Arc::clone(&outbox),
         Arc::clone(&board),
@@ -238,6 +273,18 @@ pub async fn run(
         let _ended = tokio::task::spawn_blocking(move || thread.join()).await;
     }
     Ok(())
+}
+
+fn open_signing(
+    mission: &Mission,
+    clock: &ServiceClock,
+) -> Result<Option<SigningFile>, SigningFileError> {
+    let Some(signing) = &mission.mavlink_signing else {
+        return Ok(None);
+    };
+    let path = mission.state_dir.join("mavlink-signing.json");
+    let (key, ids) = (signing.key.clone(), signing.unsigned_ids.clone());
+    SigningFile::open(&path, key, ids, clock()).map(Some)
 }
 
 async fn until_told_to_stop() {

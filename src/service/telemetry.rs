@@ -2,18 +2,22 @@
 //! they come, keeps time, hands frames to the pipeline, sends alarms.
 
 use super::core::Input;
+use super::courier::keep_action;
 use super::{Board, SharedOutbox, lock};
 use crate::deliver::mavlink::{MavlinkDelivery, MavlinkSettings};
+use crate::deliver::signing_file::SigningFile;
+use crate::deliver::{AlarmLink, Receipt, Settled, orders};
 use crate::ingest::ServiceClock;
 use crate::mission::Mission;
 use emberfix_frames::{ServiceTime, SignedDuration};
 use emberfix_mav::outgoing::{
-    companion_heartbeat, set_message_interval, status_text, timesync_request,
+    command, command_ack, companion_heartbeat, set_message_interval, status_text, timesync_request,
 };
-use emberfix_mav::telemetry::{Severity, StatusText};
+use emberfix_mav::signing::SIGNATURE_LEN;
+use emberfix_mav::telemetry::{CommandAck, CommandResult, Severity, StatusText};
 use emberfix_mav::{
-    Address, Chunk, ComponentId, Encoder, FrameReader, Link, MavMessage, Peer, Received, SystemId,
-    Telemetry, message_name,
+    Address, Chunk, ComponentId, Encoder, FrameReader, Judgement, Link, MavMessage, Peer, Received,
+    SystemId, Telemetry, message_name,
 };
 use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::sync::Arc;
@@ -51,6 +55,8 @@ pub struct Talk {
     configured: Option<SystemId>,
     agent: Address,
     delivery: Option<MavlinkDelivery>,
+    signing: Option<SigningFile>,
+    uav: String,
     outbox: SharedOutbox,
     board: Arc<Board>,
     clock: ServiceClock,
@@ -70,6 +76,7 @@ pub struct Talk {
 impl Talk {
     pub fn new(
         link: Link,
+        signing: Option<SigningFile>,
         mission: &Mission,
         outbox: SharedOutbox,
         board: Arc<Board>,
@@ -84,6 +91,8 @@ impl Talk {
             configured: (mission.system_id != 0).then_some(SystemId(mission.system_id)),
             agent: Address::new(system, component),
             delivery: None,
+            signing,
+            uav: mission.uav.clone(),
             outbox,
             board,
             clock,
@@ -105,13 +114,13 @@ impl Talk {
         look.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
         loop {
             tokio::select! {
-                chunk = self.link.recv() => self.take(&chunk, &events),
+                chunk = self.link.recv() => self.take(&chunk, &events).await,
                 _ = look.tick() => self.work_off().await,
             }
         }
     }
 
-    fn take(&mut self, chunk: &Chunk, events: &SyncSender<Input>) {
+    async fn take(&mut self, chunk: &Chunk, events: &SyncSender<Input>) {
         let arrived = (self.clock)();
         if self.readers.len() >= MAX_PEERS && !self.readers.contains_key(&chunk.from) {
             self.readers.clear();
@@ -123,7 +132,67 @@ impl Talk {
             frames.push(received);
         }
         for received in frames {
+            let judgement = self
+                .signing
+                .as_mut()
+                .map(|file| file.judge(&received.frame));
+            if matches!(judgement, Some(Judgement::Refused(_))) {
+                continue;
+            }
+            if let Some(answer) = self.obey(&received, arrived, events) {
+                self.send(&answer).await;
+            }
+            if judgement == Some(Judgement::Signed) {
+                self.note_time(&received);
+            }
             self.take_frame(arrived, chunk.from, received, events);
+        }
+    }
+
+    /// An operator's action from our ground agent: kept, then answered.
+    fn obey(
+        &mut self,
+        received: &Received,
+        now: ServiceTime,
+        events: &SyncSender<Input>,
+    ) -> Option<MavMessage> {
+        let own = self.encoder.as_ref()?.sender();
+        let sender = received.frame.sender();
+        let order = match &received.telemetry {
+            Ok(Telemetry::CommandLong(order)) => order,
+            _ => return None,
+        };
+        if order.command != command::USER_2 || sender != self.agent || order.target != own {
+            return None;
+        }
+        let action = orders::decode(order, &self.uav, now);
+        let number = action.as_ref().map_or(0, |action| action.number);
+        let kept = action.map(|action| keep_action(&self.outbox, Some(events), action));
+        let result = match kept {
+            Some(true) => CommandResult::Accepted,
+            Some(false) => CommandResult::TemporarilyRejected,
+            None => CommandResult::Denied,
+        };
+        command_ack(&CommandAck {
+            command: order.command,
+            result,
+            result_param2: i32::try_from(number).unwrap_or(0),
+            target: sender,
+        })
+        .ok()
+    }
+
+    /// The UTC of a signed autopilot counts for signatures.
+    fn note_time(&mut self, received: &Received) {
+        let utc = match &received.telemetry {
+            Ok(Telemetry::SystemTime(time)) => time.utc,
+            _ => None,
+        };
+        if let (Some(utc), Some(file)) = (utc, &mut self.signing) {
+            file.note_time(utc);
+            if let Some(encoder) = &mut self.encoder {
+                encoder.advance(utc);
+            }
         }
     }
 
@@ -176,9 +245,15 @@ impl Talk {
                 system,
                 component: ComponentId::ONBOARD_COMPUTER,
             };
-            self.encoder = Some(Encoder::new(own));
+            let signer = self
+                .signing
+                .as_ref()
+                .map(|file| file.signer(0, (self.clock)()));
+            let signature_bytes = if signer.is_some() { SIGNATURE_LEN } else { 0 };
+            self.encoder = Some(Encoder::new(own).signing(signer));
             self.delivery = Some(MavlinkDelivery::new(MavlinkSettings {
                 ground: self.agent,
+                signature_bytes,
                 ..MavlinkSettings::new(own)
             }));
             tracing::info!(system = system.0, "vehicle heard");
@@ -199,19 +274,25 @@ impl Talk {
     }
 
     fn observe(&mut self, sender: Address, telemetry: &Telemetry, now: ServiceTime) {
-        let delivery = self.delivery.as_mut();
-        let Some(receipt) = delivery.and_then(|d| d.observe(sender, telemetry, now)) else {
-            return;
-        };
-        let stored =
-            lock(&self.outbox).acknowledge(MavlinkDelivery::NAME, &receipt.id, receipt.revision);
-        if let Err(error) = stored {
-            tracing::error!(%error, "receipt not stored; it will be sent again");
+        if let Some(delivery) = &mut self.delivery {
+            delivery.observe(sender, telemetry, now);
+        }
+    }
+
+    /// Signatures go on with the clock, and what must outlive us is written.
+    fn keep_time(&mut self, now: ServiceTime) {
+        if let Some(file) = &mut self.signing {
+            file.note_time(now);
+            file.keep(now);
+        }
+        if let Some(encoder) = &mut self.encoder {
+            encoder.advance(now);
         }
     }
 
     async fn work_off(&mut self) {
         let now = (self.clock)();
+        self.keep_time(now);
         let Some(vehicle) = self.vehicle() else {
             return;
         };
@@ -280,7 +361,7 @@ impl Talk {
     async fn tell_alarms(&mut self, now: ServiceTime) {
         if now >= self.outbox_due {
             self.outbox_due = now + OUTBOX_LOOK;
-            self.offer_pending();
+            self.offer_pending(now);
         }
         while let Some(message) = self
             .delivery
@@ -291,18 +372,41 @@ impl Talk {
         }
     }
 
-    fn offer_pending(&mut self) {
-        let pending = lock(&self.outbox).pending(MavlinkDelivery::NAME, MavlinkDelivery::MAX_FIRES);
-        let (Ok(pending), Some(delivery)) = (pending, &mut self.delivery) else {
-            tracing::error!("outbox not readable");
+    fn offer_pending(&mut self, now: ServiceTime) {
+        let Some(delivery) = &mut self.delivery else {
             return;
         };
-        for alarm in &pending {
-            if let Err(error) = delivery.offer(alarm) {
-                let (id, revision) = (alarm.properties.id.clone(), alarm.properties.revision);
-                if self.refused.insert(id, revision) != Some(revision) {
-                    tracing::warn!(%error, id = alarm.properties.id, "alarm not told over MAVLink");
-                }
+        let mut outbox = lock(&self.outbox);
+        let pending = match outbox.pending(MavlinkDelivery::NAME, MavlinkDelivery::MAX_FIRES) {
+            Ok(pending) => pending,
+            Err(error) => {
+                tracing::error!(%error, "outbox not readable");
+                return;
+            }
+        };
+        let settled = delivery.work(&pending, now);
+        delivery.attend(|id| outbox.attention(id));
+        let receipts: Vec<Receipt> = settled.iter().filter_map(delivered).collect();
+        if !receipts.is_empty()
+            && let Err(error) = outbox.acknowledge_all(MavlinkDelivery::NAME, &receipts)
+        {
+            tracing::error!(%error, "receipts not stored; these alarms will be sent again");
+        }
+        drop(outbox);
+        self.complain(&settled);
+    }
+
+    /// Once per revision.
+    fn complain(&mut self, settled: &[Settled]) {
+        for settled in settled {
+            if let Settled::Refused {
+                id,
+                revision,
+                reason,
+            } = settled
+                && self.refused.insert(id.clone(), *revision) != Some(*revision)
+            {
+                tracing::warn!(id, reason, "alarm not told over MAVLink");
             }
         }
     }
@@ -315,5 +419,12 @@ impl Talk {
         if let Err(error) = self.link.send(&frame).await {
             tracing::debug!(%error, "MAVLink frame not sent");
         }
+    }
+}
+
+fn delivered(settled: &Settled) -> Option<Receipt> {
+    match settled {
+        Settled::Delivered(receipt) => Some(receipt.clone()),
+        Settled::Refused { .. } | Settled::Unreachable { .. } => None,
     }
 }

@@ -1,6 +1,8 @@
 //! `emberfix eval NAME`: measures, prints a table or JSON, draws.
 
 mod calibration;
+mod delivery;
+mod ground;
 mod location;
 mod range;
 mod trend;
@@ -64,6 +66,13 @@ pub enum Eval {
     Trend(trend::TrendArguments),
     /// Calibration of simulated rigs with known truth.
     Calibration(calibration::CalibrationArguments),
+    /// Alarms a second that one ground process keeps, with everyone connected.
+    Ground(ground::GroundArguments),
+    /// Alarms from the aircraft's disk to the ground's, through bad weather and kills.
+    Delivery(delivery::DeliveryArguments),
+    /// The aircraft of `delivery`, in a process of its own.
+    #[command(hide = true)]
+    DeliveryAircraft(crate::eval::delivery::aircraft::AircraftArguments),
 }
 
 /// Measures one of them.
@@ -73,5 +82,10 @@ pub fn eval(what: &Eval) -> Result<(), Failure> {
         Eval::Range(arguments) => range::range(arguments),
         Eval::Trend(arguments) => trend::trend(arguments),
         Eval::Calibration(arguments) => calibration::calibration(arguments),
+        Eval::Ground(arguments) => ground::ground(arguments),
+        Eval::Delivery(arguments) => delivery::delivery(arguments),
+        Eval::DeliveryAircraft(arguments) => {
+            crate::eval::delivery::aircraft::fly(arguments).map_err(Failure::failed)
+        }
     }
 }

@@ -83,6 +83,7 @@ fn remedy_of(error: &HttpError) -> &'static str {
         HttpError::Unreachable { .. } => {
             "start it (emberfix ground missions/ground.toml) and look at network and VPN"
         }
+        HttpError::Forged { .. } => "correct ground.public_key, or find out who answers",
         HttpError::Refused { .. } | HttpError::NoReceipt { .. } => {
             "something else answers at this address, or it refuses us: look at its log"
         }

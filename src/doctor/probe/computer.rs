@@ -1,6 +1,6 @@
 //! The companion computer: disk, outbox.
 
-use crate::deliver::Outbox;
+use crate::deliver::{Outbox, Owner};
 use crate::service::LINKS;
 use std::io::Write;
 use std::path::Path;
@@ -76,7 +76,7 @@ fn waiting(folder: &Path) -> Option<Result<Vec<(&'static str, u32)>, String>> {
     if !path.exists() {
         return None;
     }
-    let counted = Outbox::open(&path, &LINKS).and_then(|outbox| {
+    let counted = Outbox::open(&path, &LINKS, Owner::default()).and_then(|outbox| {
         let each = LINKS.iter().map(|link| Ok((*link, outbox.waiting(link)?)));
         each.collect()
     });
