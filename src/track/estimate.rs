@@ -8,7 +8,7 @@ use super::window::{About, CLOCK, Kept, Window};
 use crate::alarm::Method;
 use crate::locate::{Fix, Lens, Predicted, SHARED, Shot, Sighting, Terrain, View};
 use emberfix_frames::{Covariance, Matrix3, MissionEnu, ServiceTime, Vector3};
-use nalgebra::{Matrix2, SMatrix, SVector};
+use nalgebra::{Matrix2, SMatrix};
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
@@ -235,7 +235,7 @@ impl Estimate {
     /// Looks that solving it takes.
     #[must_use]
     pub fn looks(&self) -> usize {
-        self.window.len()
+        self.window.count()
     }
 
     /// Solves it from all looks that are kept, as of the latest of them.
@@ -259,7 +259,7 @@ impl Estimate {
             self.methods.insert(Method::Terrain);
         }
         self.unsolved = 0;
-        self.solved = self.window.len();
+        self.solved = self.window.count();
         self.solved_at = self.joint.fire();
         self.read_off();
     }

@@ -9,7 +9,7 @@
 //! estimated with each fire ([`Joint`]): what the sightings say about them is learned, what they can't
 //! say (a GNSS offset without a landmark, a clock error on a steady orbit) stays in every ellipse, and
 //! nothing averages out as if it were noise. The latest looks at each fire are kept and solved again
-//! ([`window`]), all of them linearised where the fire is believed to be now. The terrain's own error
+//! (`window`), all of them linearised where the fire is believed to be now. The terrain's own error
 //! is a number of each fire, so that looking twice at the same ground does not make it better known.
 //!
 //! **What fires share.** A fire begins with what the best known fire had learned of the shared errors up
@@ -37,7 +37,7 @@ mod life;
 mod look;
 mod pairs;
 mod shared_errors;
-pub mod window;
+mod window;
 
 pub use advice::{ADVISED, LookQuality, Outlook, advise};
 pub use assign::{Candidate, assign};

@@ -76,7 +76,7 @@ impl Window {
 
     /// Looks that are kept.
     #[must_use]
-    pub fn len(&self) -> usize {
+    pub fn count(&self) -> usize {
         self.looks.len()
     }
 
