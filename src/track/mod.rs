@@ -439,6 +439,7 @@ impl Tracker {
         sightings: &[Classified],
         view: &View<'_>,
     ) {
+        let in_doubt = self.pairs.in_doubt(&self.fires);
         for (index, classified) in sightings.iter().enumerate() {
             if let Some(slot) = slots[index].or(new[index]) {
                 let fire = &mut self.fires[slot];
@@ -447,7 +448,8 @@ impl Tracker {
                 fire.evidence.hit(sighting.at, azimuth, classified.score);
                 fire.last_seen = sighting.at;
                 note_extent(fire, sighting, view);
-                advance(fire, &self.config);
+                let is_another = !in_doubt.contains(&fire.id);
+                advance(fire, &self.config, is_another);
             }
         }
     }
@@ -522,14 +524,16 @@ impl Tracker {
     }
 }
 
-/// Suspected to confirmed, and back from out, by what was seen.
-fn advance(fire: &mut Fire, config: &TrackConfig) {
+/// Suspected to confirmed, and back from out, by what was seen. One that may be another fire, which is
+/// told already, waits until both were seen at once, or turn out to be one.
+fn advance(fire: &mut Fire, config: &TrackConfig, is_another: bool) {
     let span_s = (fire.last_seen - fire.first_seen).as_secs_f64();
     let enough =
         fire.evidence.hits() >= config.confirm_sightings && span_s >= config.confirm_span_s;
     match fire.state {
         FireState::Suspected
             if enough
+                && is_another
                 && fire.evidence.is_convincing()
                 && fire.is_located()
                 && !fire.flicker.may_be_lamp(fire.size_m, fire.evidence.hits()) =>

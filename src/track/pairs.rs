@@ -25,6 +25,8 @@ struct Odds {
 const ONE_SEEN: f64 = 0.9;
 /// A look in which both are seen: one fire does so when the detector splits it, one in twenty.
 const BOTH_SEEN: f64 = -3.0;
+/// One look in which both were seen leaves less than this.
+const IN_DOUBT: f64 = -1.0;
 /// No amount of old looks outweighs a long run of new ones.
 const SURELY_TWO: f64 = -20.0;
 /// 95 % for one.
@@ -64,6 +66,20 @@ impl Pairs {
             }
         }
         ones
+    }
+
+    /// The younger ones of pairs of which the elder is told and that may still be one.
+    #[must_use]
+    pub fn in_doubt(&self, fires: &[Fire]) -> BTreeSet<FireId> {
+        let is_told = |id: &FireId| {
+            let at = fires.binary_search_by(|fire| fire.id.cmp(id));
+            at.is_ok_and(|at| fires[at].is_confirmed() && fires[at].state != FireState::Out)
+        };
+        let pairs = self.log_odds.iter();
+        pairs
+            .filter(|((elder, _), odds)| odds.for_one > IN_DOUBT && is_told(elder))
+            .map(|((_, younger), _)| *younger)
+            .collect()
     }
 
     /// Known pairs of which both are seen at once, unless that was settled long ago.
