@@ -9,11 +9,15 @@
 //! its covariance, but only [`crate::track`] knows that they do not average out.
 
 mod geometry;
+mod lens;
 mod shared;
+mod shot;
 mod terrain;
 
-pub use geometry::{Distant, Lens, Linear, Motion, Predicted, View, range_beneath};
+pub use geometry::{Motion, View, range_beneath};
+pub use lens::{Distant, Lens, Linear, Predicted};
 pub use shared::{CONSTANT, SHARED, Shared, SharedPriors, WANDERING};
+pub use shot::Shot;
 pub use terrain::{
     Area, ConstantPlane, Coverage, Ground, Terrain, TerrainHit, Tile, TileError, TileParts,
     TileSigmas, Tiles, VerticalDatum, meet_terrain,

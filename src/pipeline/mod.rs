@@ -417,6 +417,9 @@ impl Pipeline {
             .map(|(_, sighting)| self.widened(*sighting))
             .collect();
         let outcomes = self.track(&view, &sightings);
+        if self.tracker.scatter().is_large() {
+            self.degraded.push("sightings_scatter");
+        }
         self.note_estimate();
         self.assess(pair, &seen, &outcomes, &view);
         let mut outputs = vec![Output::Pose(Box::new(pose.clone()))];

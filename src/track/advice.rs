@@ -10,7 +10,9 @@
 //! pilot's; a course that leads nearer to the fire than [`NEAREST_SHARE`] of the present ground range
 //! or [`NEAREST_M`] is never proposed. Errors are taken not to wander during the few seconds.
 
-use super::{COMMON, Fire, Tracker};
+use super::chart::OF_FIRE;
+use super::joint::JOINT;
+use super::{Fire, Tracker};
 use crate::alarm::{Advice, FireState};
 use crate::locate::{Shared, View};
 use emberfix_frames::{Covariance, Matrix3, MissionEnu, Vector3};
@@ -196,7 +198,7 @@ impl Tracker {
             return None;
         }
         let rect = view.rig.rectification();
-        let covariance = self.advised(fire, view);
+        let covariance = Self::advised(fire, view);
         advise(&Outlook {
             covariance: &covariance,
             fire: fire.estimate.position_m(),
@@ -211,23 +213,15 @@ impl Tracker {
     }
 
     /// One fire and the sums of the shared errors that turn and move the camera, see [`ADVISED`].
-    fn advised(&self, fire: &Fire, view: &View<'_>) -> SMatrix<f64, ADVISED, ADVISED> {
-        let (block, common) = (fire.estimate.block(), self.common.covariance());
-        let by_state = block.chart().position_by_state(fire.estimate.state());
-        let mut by_common = SMatrix::<f64, ADVISED, COMMON>::zeros();
-        by_common
-            .fixed_rows_mut::<3>(0)
-            .copy_from(&(by_state * block.by_common()));
+    fn advised(fire: &Fire, view: &View<'_>) -> SMatrix<f64, ADVISED, ADVISED> {
+        let mut rows = SMatrix::<f64, ADVISED, JOINT>::zeros();
+        rows.fixed_rows_mut::<3>(0)
+            .copy_from(&fire.estimate.position_rows());
         for (row, shared) in SUMMED {
             let index = shared.0 as usize + shared.1;
-            by_common[(row, index)] += view.sigmas()[index];
+            rows[(row, OF_FIRE + index)] += view.sigmas()[index];
         }
-        let mut with_common = SMatrix::<f64, ADVISED, COMMON>::zeros();
-        with_common.gemm(1.0, &by_common, common, 0.0);
-        let mut covariance = with_common * by_common.transpose();
-        let mut own = covariance.fixed_view_mut::<3, 3>(0, 0);
-        own += by_state * block.own() * by_state.transpose();
-        covariance
+        rows * fire.estimate.joint().covariance() * rows.transpose()
     }
 }
 

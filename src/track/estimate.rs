@@ -1,87 +1,127 @@
-//! Position of one fire: its [`Block`] read off at the common mean, and what that rests on.
+//! Position of one fire with the errors that it was seen through, and what that rests on.
 
-use super::block::{self, Block, Measurement, State, Told};
-use super::common::Common;
-use super::measure::{LocalGround, Look};
+use super::chart::{Chart, INVERSE_DEPTH, OF_FIRE, State, TANGENTS};
+use super::ground::LocalGround;
+use super::joint::{JOINT, Joint, JointVector, Known, LASTING, Measured, Pace, Scatter};
+use super::look::{Look, new_in_frame, rows};
+use super::window::{About, CLOCK, Kept, Window};
 use crate::alarm::Method;
-use crate::locate::{Fix, Lens, Sighting, Terrain, View};
+use crate::locate::{Fix, Lens, Predicted, SHARED, Shot, Sighting, Terrain, View};
 use emberfix_frames::{Covariance, Matrix3, MissionEnu, ServiceTime, Vector3};
-use nalgebra::Matrix2;
+use nalgebra::{Matrix2, SMatrix};
 use std::collections::BTreeSet;
+use std::sync::Arc;
 
 /// Where a fire is and how sure, and what that rests on.
 #[derive(Debug, Clone)]
 pub struct Estimate {
-    block: Block,
-    state: State,
+    chart: Chart,
+    window: Window,
+    joint: Joint,
+    /// When the errors in `joint` are those.
+    at: ServiceTime,
     position_m: Vector3<f64>,
     covariance: Matrix3<f64>,
-    /// When the covariance was last read off; it never grows while a fire is not seen.
-    read_at: Option<ServiceTime>,
-    reads: u32,
     methods: BTreeSet<Method>,
     first_sight: Vector3<f64>,
     first_at: ServiceTime,
-    ground: Option<GroundTaken>,
+    /// The camera at the first look, as reported.
+    first_camera: Vector3<f64>,
+    /// Looks since it was last solved, and looks that it was solved from.
+    unsolved: usize,
+    solved: usize,
+    /// Where it was linearised.
+    solved_at: State,
 }
 
-/// Where, and at which error, the ground was last taken in.
-#[derive(Debug, Clone, Copy, PartialEq)]
-struct GroundTaken {
-    ground: LocalGround,
-    at: Vector3<f64>,
-    sigma_m: f64,
+/// One frame as the fires share it.
+#[derive(Clone, Copy)]
+pub struct Frame<'a> {
+    /// Everything as reported.
+    pub view: &'a View<'a>,
+    /// The shutter, to be kept.
+    pub shot: &'a Arc<Shot>,
+    /// The camera as far as all fires together know it.
+    pub lens: &'a Lens,
+    /// The errors that the lens was made with.
+    pub known: &'a Known,
+    /// How errors change.
+    pub pace: &'a Pace,
+    /// How much more noise there is than was said.
+    pub scatter: Scatter,
+    /// The ground.
+    pub terrain: Option<&'a dyn Terrain>,
 }
 
-/// A sighting linearised, and what it says of the common errors.
-#[derive(Debug, Clone)]
-pub struct Taken {
-    /// Linearised.
-    pub measurement: Measurement,
-    /// What it says of the common errors.
-    pub told: Told,
-    ground: Option<GroundTaken>,
-    has_disparity: bool,
+/// A fire as the camera should see it.
+#[derive(Debug, Clone, Copy)]
+pub struct Seen {
+    /// Column, row, disparity.
+    pub value: Vector3<f64>,
+    /// Their covariance but for what is new in each frame.
+    pub spread: Matrix3<f64>,
+    /// Of what is new in each frame.
+    pub new: Matrix3<f64>,
 }
 
 /// Bearings further apart than this make a parallax, radians.
 const PARALLAX_RAD: f64 = 0.05;
-/// The ground is taken in anew when the horizontal error has become this much smaller..
-const GROUND_AGAIN: f64 = 0.5;
-/// .. or when the position has moved by this many of the errors that it was taken in with.
-const GROUND_MOVED: f64 = 1.0;
 /// Horizontal error over range beyond which the ground is not taken in: its plane could be anywhere.
 const GROUND_REACH: f64 = 0.7;
-/// Inverse depth before anything is known: 10 m, to infinity at one sigma, 1/m.
-const INVERSE_DEPTH: (f64, f64) = (0.1, 0.1);
-/// Times that a covariance is read off at every sighting.
-const YOUNG_READS: u32 = 40;
-/// Seconds after which it is read off again: when the fire is seen, and when it is not.
-const READ_S: (f64, f64) = (0.3, 1.0);
+/// Inverse depth before anything is known, 1/m: 100 m, its one sigma from 17 m to infinity. What has no
+/// range from stereo or the ground is far, and looked for where far things stay in the image.
+const INVERSE_DEPTH_PRIOR: (f64, f64) = (0.01, 0.05);
+/// A fire with so few looks is solved at each..
+const YOUNG: usize = 16;
+/// .. and later when this share of its looks is new, or when it has moved along its line of sight by
+/// this share of the range, or across it by this angle (radians), since.
+const NEW_SHARE: f64 = 0.2;
+const MOVED_SHARE: f64 = 0.02;
+const MOVED_RAD: f64 = 0.01;
 
 impl Estimate {
-    /// Nothing known but the pixel: inverse depth as unknown as it can be, or within what stereo
-    /// leaves when it says that it would have seen anything nearer than `at_least_m`.
+    /// A fire that was seen once; `None` when the sighting makes no sense.
+    ///
+    /// Its inverse depth is as unknown as it can be, or within what stereo leaves when it says that
+    /// it would have seen anything nearer.
     #[must_use]
-    pub fn unseen(sighting: &Sighting, lens: &Lens, terrain_sigma_m: f64, common: &Common) -> Self {
+    pub fn begin(sighting: &Sighting, frame: &Frame<'_>, fix: Option<&Fix>) -> Option<Self> {
+        let ray = frame.lens.ray_enu(sighting.base);
         let inverse_depth = match (sighting.at_least_m, sighting.disparity) {
             (Some(least), None) if least > 0.0 => (0.5 / least, 0.5 / least),
-            _ => INVERSE_DEPTH,
+            _ => INVERSE_DEPTH_PRIOR,
         };
-        let ray = lens.ray_enu(sighting.base);
-        let block = Block::unseen(lens, &ray, inverse_depth, terrain_sigma_m, common);
-        Self {
-            block,
-            state: State::zeros(),
-            position_m: *lens.centre(),
+        let place = fix.map_or(&frame.view.pose.place, |fix| &fix.place);
+        let terrain_sigma_m = frame.terrain.map_or(0.0, |terrain| terrain.sigma_m(place));
+        let joint = Joint::unseen(frame.known, frame.lens, inverse_depth, terrain_sigma_m);
+        let now = frame.view.pose.at;
+        let mut estimate = Self {
+            chart: Chart::along(frame.lens, &frame.known.all(), &ray),
+            window: Window::new(joint.clone(), now),
+            solved_at: joint.fire(),
+            joint,
+            at: now,
+            position_m: *frame.lens.centre(),
             covariance: Matrix3::zeros(),
-            read_at: None,
-            reads: 0,
             methods: BTreeSet::new(),
             first_sight: ray,
             first_at: sighting.at,
-            ground: None,
+            first_camera: frame.view.camera_enu,
+            unsolved: 0,
+            solved: 0,
+        };
+        let mut start = *estimate.joint.mean();
+        if let Some(fix) = fix {
+            start[INVERSE_DEPTH] = 1.0 / fix.range_m;
         }
+        let state: State = start.fixed_rows::<OF_FIRE>(0).into_owned();
+        estimate.measure(sighting, frame, &start)?;
+        estimate.position_m = estimate.chart.position(&state);
+        let ground =
+            fix.and_then(|fix| estimate.ground(frame, &start, &horizontal(fix.covariance.m2())));
+        estimate.keep(sighting, frame);
+        estimate.solve_about(&start, frame, ground.as_ref());
+        Some(estimate)
     }
 
     /// Position in the mission plane, metres.
@@ -90,21 +130,16 @@ impl Estimate {
         self.position_m
     }
 
-    /// Its coordinates at the common mean.
+    /// The fire with the errors that it was seen through.
     #[must_use]
-    pub fn state(&self) -> &State {
-        &self.state
+    pub fn joint(&self) -> &Joint {
+        &self.joint
     }
 
-    /// Its coordinates as a function of the common errors.
+    /// What its numbers mean.
     #[must_use]
-    pub fn block(&self) -> &Block {
-        &self.block
-    }
-
-    /// Its coordinates as a function of the common errors.
-    pub fn block_mut(&mut self) -> &mut Block {
-        &mut self.block
+    pub fn chart(&self) -> &Chart {
+        &self.chart
     }
 
     /// Covariance of the position.
@@ -125,117 +160,206 @@ impl Estimate {
         self.methods.iter().copied().collect()
     }
 
-    /// Follows what was learned of the common errors. The covariance is read off when the fire was
-    /// just seen, and now and then otherwise or once it has settled: it only shrinks, so an older one is
-    /// never too small.
-    pub fn read_off(&mut self, common: &Common, now: ServiceTime, is_seen: bool) {
-        self.state = self.block.state(common);
-        self.position_m = self.block.chart().position(&self.state);
-        let since_s = self
-            .read_at
-            .map_or(f64::INFINITY, |at| (now - at).as_secs_f64());
-        let is_young = is_seen && self.reads < YOUNG_READS;
-        let limit_s = if is_seen { READ_S.0 } else { READ_S.1 };
-        if is_young || since_s >= limit_s {
-            let common = common.covariance();
-            self.covariance = self.block.position_covariance(&self.state, common);
-            self.read_at = Some(now);
-            self.reads = self.reads.saturating_add(1);
-        }
+    /// Where it should be seen, if the camera is what all fires together know; `None` behind it.
+    #[must_use]
+    pub fn predict(&self, lens: &Lens) -> Option<Predicted> {
+        let (point, _, _) = self.chart.distant(&self.joint.fire());
+        lens.predict(&point)
     }
 
-    /// Linearises a sighting about what is known now; nothing changes yet. A new fire is looked for
-    /// about its first `fix`, if it has one.
+    /// Lets the errors change up to now.
+    pub fn age(&mut self, now: ServiceTime, pace: &Pace) {
+        self.joint.age((now - self.at).as_secs_f64(), pace);
+        self.at = now;
+    }
+
+    /// Where it should be seen by what it knows of the errors itself, as of now.
     #[must_use]
-    pub fn take(
-        &self,
-        sighting: &Sighting,
-        lens: &Lens,
-        view: &View<'_>,
-        terrain: Option<&dyn Terrain>,
-        common: &Common,
-        fix: Option<&Fix>,
-    ) -> Option<Taken> {
-        let mut start = self.block.state(common);
-        if let Some(fix) = fix {
-            start[block::INVERSE_DEPTH] = 1.0 / fix.range_m;
-        }
-        let ground = self.ground_that_is_due(&start, view, terrain, fix);
-        let look = Look {
-            sighting,
-            lens,
-            up: *view.up(),
-            ground: ground.map(|taken| taken.ground),
-            flown_share: self.flown_share(lens, view, common),
-        };
-        let (measurement, at) = look.measure(&self.block, common, start)?;
-        let told = self.block.tells(&measurement, &at, common)?;
-        Some(Taken {
-            measurement,
-            told,
-            ground,
-            has_disparity: sighting.disparity.is_some(),
+    pub fn seen(&self, frame: &Frame<'_>) -> Option<Seen> {
+        let state = self.joint.fire();
+        let (point, _, _) = self.chart.distant(&state);
+        let linear = frame.lens.linear(&point)?;
+        let way = self.chart.way(frame.lens, &frame.known.all());
+        let by_state = self.chart.slopes(&linear, &state, frame.lens, &way);
+        let rows = rows(&by_state, &linear.by_shared);
+        let apart = self.joint.mean() - self.point(frame);
+        Some(Seen {
+            value: linear.value + rows * apart,
+            spread: rows * self.joint.covariance() * rows.transpose(),
+            new: new_in_frame(&linear.by_shared) * frame.scatter.variance(),
         })
     }
 
-    fn flown_share(&self, lens: &Lens, view: &View<'_>, common: &Common) -> f64 {
-        let since_s = (view.pose.at - self.first_at).as_secs_f64();
-        let variances = view.priors().way_variances(view.sigmas(), since_s);
-        let state = self.block.state(common);
-        self.block.flown_share(&state, lens.centre(), &variances)
+    /// What is left of a sighting of it, column, row, disparity, and whether it has the last.
+    #[must_use]
+    pub fn left(&self, sighting: &Sighting, frame: &Frame<'_>) -> Option<(Vector3<f64>, bool)> {
+        let at = self.point(frame);
+        let measured = self.measure(sighting, frame, &at)?;
+        Some((self.joint.left(&measured, &at), measured.has_disparity))
     }
 
-    /// Takes in what was linearised, given the common mean that it was linearised at.
-    pub fn learn(&mut self, taken: &Taken, mean: &nalgebra::DVector<f64>, camera: &Vector3<f64>) {
-        self.block.learn(&taken.measurement, &taken.told, mean);
-        if taken.has_disparity {
+    /// Takes a sighting in, linearised at what is known now. [`Estimate::solve`] does better.
+    ///
+    /// Returns its squared distance from where it should be over its numbers: 1 on average.
+    pub fn take(&mut self, sighting: &Sighting, frame: &Frame<'_>) -> Option<f64> {
+        let at = self.point(frame);
+        let squared = self.measure(sighting, frame, &at).and_then(|mut measured| {
+            measured.noise *= frame.scatter.variance();
+            self.joint.take(&measured, &at)
+        });
+        self.joint.hold(at[INVERSE_DEPTH]);
+        self.keep(sighting, frame);
+        self.read_off();
+        squared
+    }
+
+    /// How much it is to be solved again: looks that are new over looks that were solved; from one on
+    /// it is due.
+    #[must_use]
+    pub fn need(&self) -> f64 {
+        let news = self.unsolved as f64;
+        if self.unsolved == 0 {
+            return 0.0;
+        }
+        if self.solved < YOUNG {
+            return 1.0 + news / self.solved.max(1) as f64;
+        }
+        let (now, then) = (self.joint.fire(), self.solved_at);
+        let along = (now[INVERSE_DEPTH] / then[INVERSE_DEPTH] - 1.0).abs() / MOVED_SHARE;
+        let across = (now - then).fixed_rows::<2>(TANGENTS).norm() / MOVED_RAD;
+        (news / (NEW_SHARE * self.solved as f64))
+            .max(along)
+            .max(across)
+    }
+
+    /// Looks that solving it takes.
+    #[must_use]
+    pub fn looks(&self) -> usize {
+        self.window.count()
+    }
+
+    /// Solves it from all looks that are kept, as of the latest of them.
+    pub fn solve(&mut self, frame: &Frame<'_>) {
+        let at = *self.joint.mean();
+        let ground = self.ground(frame, &at, &horizontal(&self.covariance));
+        self.solve_about(&at, frame, ground.as_ref());
+    }
+
+    fn solve_about(&mut self, at: &JointVector, frame: &Frame<'_>, ground: Option<&LocalGround>) {
+        let about = About {
+            at,
+            when: self.at,
+            clock_sigma: self.joint.sigma(CLOCK),
+            scatter: frame.scatter,
+        };
+        let (joint, when) = self.window.solve(&self.chart, &about, frame.pace, ground);
+        (self.joint, self.at) = (joint, when);
+        self.joint.hold(at[INVERSE_DEPTH]);
+        if ground.is_some() {
+            self.methods.insert(Method::Terrain);
+        }
+        self.unsolved = 0;
+        self.solved = self.window.count();
+        self.solved_at = self.joint.fire();
+        self.read_off();
+    }
+
+    /// Fire as known here, errors as the lens of the frame has them.
+    fn point(&self, frame: &Frame<'_>) -> JointVector {
+        let mut point = *self.joint.mean();
+        point
+            .fixed_rows_mut::<LASTING>(OF_FIRE)
+            .copy_from(&frame.known.mean);
+        point
+    }
+
+    fn measure(
+        &self,
+        sighting: &Sighting,
+        frame: &Frame<'_>,
+        at: &JointVector,
+    ) -> Option<Measured> {
+        let look = Look {
+            sighting,
+            lens: frame.lens,
+            up: frame.view.up(),
+            flown_share: self.flown_share(frame),
+        };
+        look.measure(&self.chart, at)
+    }
+
+    fn flown_share(&self, frame: &Frame<'_>) -> f64 {
+        let view = frame.view;
+        let since_s = (view.pose.at - self.first_at).as_secs_f64();
+        let variances = view.priors().way_variances(view.sigmas(), since_s);
+        let way = view.camera_enu - self.first_camera;
+        self.chart.flown_share(&way, &variances)
+    }
+
+    fn keep(&mut self, sighting: &Sighting, frame: &Frame<'_>) {
+        let kept = Kept {
+            shot: Arc::clone(frame.shot),
+            sighting: *sighting,
+            flown_share: self.flown_share(frame),
+        };
+        self.window.add(kept);
+        if self.window.is_over() {
+            self.fold(frame);
+        }
+        self.unsolved += 1;
+        if sighting.disparity.is_some() {
             self.methods.insert(Method::Stereo);
         }
-        if let Some(ground) = taken.ground {
-            self.methods.insert(Method::Terrain);
-            self.ground = Some(ground);
-        }
-        let sight = self.position_m - camera;
-        if self.read_at.is_some() && sight.angle(&self.first_sight) > PARALLAX_RAD {
+        let sight = self.position_m - frame.lens.centre();
+        if sight.angle(&self.first_sight) > PARALLAX_RAD {
             self.methods.insert(Method::Parallax);
         }
     }
 
-    /// The ground counts when it was never taken in, and again when the position is much better known
-    /// than then or is another one, and the plane that stood for it no longer does. Not with every
-    /// look, since it is the same ground.
-    fn ground_that_is_due(
-        &self,
-        start: &State,
-        view: &View<'_>,
-        terrain: Option<&dyn Terrain>,
-        fix: Option<&Fix>,
-    ) -> Option<GroundTaken> {
-        let terrain = terrain?;
-        let at = self.block.chart().position(start);
-        let horizontal = match (fix, self.read_at) {
-            (Some(fix), _) => horizontal(fix.covariance.m2()),
-            (None, Some(_)) => horizontal(&self.covariance),
-            (None, None) => return None,
+    fn fold(&mut self, frame: &Frame<'_>) {
+        let at = *self.joint.mean();
+        let ground = self.ground(frame, &at, &horizontal(&self.covariance));
+        let about = About {
+            at: &at,
+            when: self.at,
+            clock_sigma: self.joint.sigma(CLOCK),
+            scatter: frame.scatter,
         };
+        self.window
+            .fold(&self.chart, &about, frame.pace, ground.as_ref());
+    }
+
+    fn read_off(&mut self) {
+        let state = self.joint.fire();
+        self.position_m = self.chart.position(&state);
+        let slope = self.chart.position_by_state(&state);
+        let fire = self.joint.covariance().fixed_view::<OF_FIRE, OF_FIRE>(0, 0);
+        let m2 = slope * fire * slope.transpose();
+        self.covariance = (m2 + m2.transpose()) * 0.5;
+    }
+
+    /// The ground about the fire, unless that could be anywhere or was folded away with old looks.
+    fn ground(
+        &self,
+        frame: &Frame<'_>,
+        at: &JointVector,
+        horizontal: &Matrix2<f64>,
+    ) -> Option<LocalGround> {
+        let terrain = frame.terrain.filter(|_| self.window.wants_ground())?;
+        let state: State = at.fixed_rows::<OF_FIRE>(0).into_owned();
+        let place = self.chart.position(&state);
         let sigma_m = horizontal.trace().max(0.0).sqrt();
-        if sigma_m > GROUND_REACH * (at - view.camera_enu).norm() {
+        if sigma_m > GROUND_REACH * (place - frame.view.camera_enu).norm() {
             return None;
         }
-        let is_news = self.ground.is_none_or(|taken| {
-            let is_other = sigma_m < GROUND_AGAIN * taken.sigma_m
-                || (at - taken.at).xy().norm() > GROUND_MOVED * taken.sigma_m;
-            is_other && !taken.ground.holds_at(&at, view, terrain)
-        });
-        if !is_news {
-            return None;
-        }
-        let ground = LocalGround::about(&at, &horizontal, view, terrain)?;
-        Some(GroundTaken {
-            ground,
-            at,
-            sigma_m,
-        })
+        LocalGround::about(&place, horizontal, frame.view, terrain)
+    }
+
+    /// Rows over [`JOINT`] of the position.
+    #[must_use]
+    pub fn position_rows(&self) -> SMatrix<f64, 3, JOINT> {
+        let slope = self.chart.position_by_state(&self.joint.fire());
+        rows(&slope, &SMatrix::<f64, 3, SHARED>::zeros())
     }
 }
 

@@ -5,48 +5,56 @@
 //! as far as they are known ([`SharedErrors`]). Pure: no I/O, no clock.
 //!
 //! **Estimation.** Bearing, disparity and terrain are fused always and switched never. GNSS offset,
-//! heading, tilt and boresight, lever arm, disparity offset and clock offset are states that all
-//! fires share ([`Common`]): what the sightings say about them is learned, what they can't say (a
-//! GNSS offset without a landmark, a clock error on a steady orbit) stays in every ellipse, and
-//! nothing averages out as if it were noise. Each fire is a function of those ([`Block`]), so the
-//! cost is linear in the fires. The camera is linearised about what is known at that moment, the
-//! clock error over its whole spread. The terrain's own error is a state of each fire, so that
-//! looking twice at the same ground does not make it better known.
+//! heading, tilt and boresight, lever arm, disparity offset and clock offset are states that are
+//! estimated with each fire ([`Joint`]): what the sightings say about them is learned, what they can't
+//! say (a GNSS offset without a landmark, a clock error on a steady orbit) stays in every ellipse, and
+//! nothing averages out as if it were noise. The latest looks at each fire are kept and solved again
+//! (`window`), all of them linearised where the fire is believed to be now. The terrain's own error
+//! is a number of each fire, so that looking twice at the same ground does not make it better known.
+//!
+//! **What fires share.** A fire begins with what the best known fire had learned of the shared errors up
+//! to that moment ([`Known`]), and learns on by its own sightings alone. So nothing is counted twice:
+//! fires that are seen in the same frames see through the same errors, and a hundred of them
+//! are no hundred witnesses. What they would teach each other while both are seen is given up for
+//! that; in return each ellipse is exact for its own sightings, and the cost is linear in the fires.
 //!
 //! **Association.** Sightings and fires are matched in the image, all at once at the least total cost
-//! ([`assign`]); the distance holds the fire's own error and the common errors together.
+//! ([`assign`]); each fire knows the errors of the moment, so what both were seen through does not
+//! blur two fires side by side. A sighting that strays from a fire which is not seen otherwise is
+//! given to it with as much more noise as it strays.
 //!
-//! **Known limits.** A fire is a point with a size, not an area. Of what the wandering errors do to
-//! all fires alike, the part that the kept knots do not tell is lost (see [`Common`]).
+//! **Known limits.** A fire is a point with a size; its area is [`crate::assess`]'s.
 //! **Bound.** [`MAX_FIRES`] are kept; beyond, the suspected one with the least evidence goes.
 
 mod advice;
 mod assign;
-mod block;
-mod common;
+mod chart;
 mod estimate;
 mod glimpse;
+mod ground;
+mod joint;
 mod life;
-mod measure;
+mod look;
 mod pairs;
 mod shared_errors;
+mod window;
 
 pub use advice::{ADVISED, LookQuality, Outlook, advise};
 pub use assign::{Candidate, assign};
-pub use block::{Block, Chart};
-pub use common::{COMMON, Common, KNOTS};
+pub use chart::Chart;
 pub use estimate::Estimate;
+pub use joint::{JOINT, Joint, Known, LASTING, Pace, Scatter};
 pub use life::Evidence;
 pub use shared_errors::{Estimated, SharedErrors};
 
 use crate::alarm::{AlarmClass, FireId, FireState, Method, SizeM};
-use crate::locate::{Lens, Shared, Sighting, Terrain, View, fix};
+use crate::locate::{Shared, Sighting, Terrain, View, fix};
 use emberfix_frames::{Coordinate, Covariance, Metres, MissionEnu, ServiceTime, Vector3};
-use estimate::Taken;
+use estimate::Frame;
 use glimpse::Glimpse;
-use nalgebra::{DMatrix, DVector};
 use pairs::Pairs;
 use std::collections::BTreeSet;
+use std::sync::Arc;
 
 /// A sighting and what it is said to be.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -161,7 +169,8 @@ pub struct Tracker {
     config: TrackConfig,
     fires: Vec<Fire>,
     next: FireId,
-    common: Common,
+    known: Known,
+    scatter: Scatter,
     shared: Option<SharedErrors>,
     pairs: Pairs,
     last_step: Option<ServiceTime>,
@@ -172,7 +181,7 @@ pub const MAX_FIRES: usize = 16_384;
 /// Room that is kept for the next frame's new fires.
 const ROOM: usize = 256;
 /// Largest horizontal sigma over range at which a fire is told.
-const MAX_RELATIVE_SIGMA: f64 = 0.3;
+const MAX_RELATIVE_SIGMA: f64 = 0.2;
 /// Horizontal sigma that is good enough from however near, metres.
 const NEAR_ENOUGH_M: f64 = 5.0;
 /// A fire counts as missed from up to this many times the range that it was seen from.
@@ -180,6 +189,10 @@ const MISS_REACH: f64 = 1.1;
 /// How far the clock error's spread is looked over, in its sigmas and at most, seconds.
 const CLOCK_SIGMAS: f64 = 1.75;
 const LOOK_AHEAD_S: f64 = 0.6;
+/// Looks that are solved again in a frame at most, but for the last fire's.
+const SOLVED_LOOKS: usize = 400;
+/// Every so many sightings a fire teaches what it has learned.
+const TEACHES: u32 = 4;
 /// Sightings in a row that may stray from a fire before another one begins there.
 const STRAYS: u8 = 8;
 /// Smoke this close to a fire's pixel, in its own sizes, is that fire's smoke.
@@ -193,7 +206,8 @@ impl Tracker {
             config,
             fires: Vec::new(),
             next: first,
-            common: Common::default(),
+            known: Known::default(),
+            scatter: Scatter::default(),
             shared: None,
             pairs: Pairs::default(),
             last_step: None,
@@ -210,6 +224,12 @@ impl Tracker {
     #[must_use]
     pub fn shared_errors(&self) -> Option<&SharedErrors> {
         self.shared.as_ref()
+    }
+
+    /// How much more the sightings scatter than their noise was said to be.
+    #[must_use]
+    pub fn scatter(&self) -> Scatter {
+        self.scatter
     }
 
     /// How far after a shutter the reported pose may have to be known, seconds: where the clock error
@@ -232,151 +252,131 @@ impl Tracker {
         terrain: Option<&dyn Terrain>,
     ) -> Vec<Outcome> {
         let now = view.pose.at;
-        self.age(view);
-        let lens = self.lens(view);
-        let glimpses = glimpse::all(&self.fires, &self.common, &lens, view.rig);
-        let matches = glimpse::associate(&glimpses, &self.fires, sightings, &lens, view);
+        let pace = Pace::new(view.priors(), view.sigmas());
+        self.age(now, &pace);
+        let known = self.known.clone();
+        let clock = Shared::Clock as usize;
+        let clock_sigma = known.covariance[(clock, clock)].max(0.0).sqrt();
+        let shot = Arc::new(view.shot(known.mean[clock], clock_sigma));
+        let frame = Frame {
+            view,
+            shot: &shot,
+            lens: &shot.lens(&known.all(), clock_sigma),
+            known: &known,
+            pace: &pace,
+            scatter: self.scatter,
+            terrain,
+        };
+        let glimpses = glimpse::all(&mut self.fires, &frame);
+        let mut matches = glimpse::associate(&glimpses, &self.fires, sightings, &frame);
+        self.tolerate(&mut matches);
         let slots = matches.slots;
-        self.update(&slots, sightings, &lens, view, terrain);
-        let strays = self.tolerated(&slots, &matches.strays);
-        let new = self.initiate(&slots, &strays, sightings, view, terrain);
-        let seen: BTreeSet<usize> = slots.iter().chain(&new).copied().flatten().collect();
-        for (slot, fire) in self.fires.iter_mut().enumerate() {
-            fire.estimate
-                .read_off(&self.common, now, seen.contains(&slot));
+        for (slot, classified) in slots.iter().zip(sightings) {
+            let Some(slot) = slot else { continue };
+            let estimate = &mut self.fires[*slot].estimate;
+            if let Some(squared) = estimate.take(&classified.sighting, &frame) {
+                self.scatter.note(squared);
+            }
         }
+        let new = self.initiate(&slots, sightings, &frame);
+        let seen: BTreeSet<usize> = slots.iter().chain(&new).copied().flatten().collect();
+        self.solve(&seen, &frame);
         self.note_sightings(&slots, &new, sightings, view);
         self.note_misses(&seen, &glimpses, view);
+        self.learn(&seen);
         let outcomes = self.outcomes(&slots, &new);
         self.merge(&seen, &glimpses, now);
         self.forget(now);
-        self.shared = Some(SharedErrors::read_off(&self.common, view));
+        self.shared = Some(SharedErrors::read_off(&self.known, view));
         outcomes
     }
 
     /// Lets time pass since the last frame.
-    fn age(&mut self, view: &View<'_>) {
-        let dt_s = self
+    fn age(&mut self, now: ServiceTime, pace: &Pace) {
+        let since = self
             .last_step
-            .map_or(0.0, |last| (view.pose.at - last).as_secs_f64());
-        self.last_step = Some(view.pose.at);
-        for passage in self.common.age(dt_s, view.priors(), view.sigmas()) {
-            for fire in &mut self.fires {
-                fire.estimate.block_mut().carry(&passage);
+            .map_or(0.0, |last| (now - last).as_secs_f64());
+        self.last_step = Some(now);
+        self.known.age(since, pace);
+    }
+
+    /// Gives strays to their fires: a few in a row, and no more, lest a fire that is placed wrongly
+    /// keeps the true place from being found.
+    fn tolerate(&mut self, matches: &mut glimpse::Matches) {
+        for slot in matches.slots.iter().flatten() {
+            self.fires[*slot].strays = 0;
+        }
+        for (slot, stray) in matches.slots.iter_mut().zip(&matches.strays) {
+            if let Some(stray) = stray {
+                let fire = &mut self.fires[*stray];
+                fire.strays = fire.strays.saturating_add(1);
+                *slot = slot.or((fire.strays <= STRAYS).then_some(*stray));
             }
         }
     }
 
-    /// The camera, as far as it is known.
-    fn lens(&self, view: &View<'_>) -> Lens {
-        let clock_sigma = self.common.sigma(Shared::Clock as usize);
-        view.lens(&self.common.now(), clock_sigma)
-    }
-
-    /// Known fires learn from their sightings, and the common errors from all of them.
-    fn update(
-        &mut self,
-        slots: &[Option<usize>],
-        sightings: &[Classified],
-        lens: &Lens,
-        view: &View<'_>,
-        terrain: Option<&dyn Terrain>,
-    ) {
-        let pairs = slots.iter().zip(sightings);
-        let taken = pairs.filter_map(|(slot, classified)| {
-            let slot = (*slot)?;
-            let estimate = &self.fires[slot].estimate;
-            let sighting = &classified.sighting;
-            let taken = estimate.take(sighting, lens, view, terrain, &self.common, None)?;
-            Some((slot, taken))
-        });
-        let taken: Vec<_> = taken.collect();
-        self.absorb(&taken, lens);
-    }
-
-    fn absorb(&mut self, taken: &[(usize, Taken)], lens: &Lens) {
-        let mean = self.common.mean().clone();
-        let (columns, residual) = stacked(taken);
-        for (slot, taken) in taken {
-            self.fires[*slot]
-                .estimate
-                .learn(taken, &mean, lens.centre());
-        }
-        self.common.update(&columns, &residual);
-    }
-
-    /// Which sightings are put down to a fire that they stray from: a few in a row, and no more, lest a
-    /// fire that is placed wrongly keeps the true place from being found.
-    fn tolerated(&mut self, slots: &[Option<usize>], strays: &[Option<usize>]) -> Vec<bool> {
-        for slot in slots.iter().flatten() {
-            self.fires[*slot].strays = 0;
-        }
-        let tolerates = |fire: &mut Fire| {
-            fire.strays = fire.strays.saturating_add(1);
-            fire.strays <= STRAYS
-        };
-        strays
+    /// Solves the fires that need it most, as far as there is time in a frame for it.
+    fn solve(&mut self, seen: &BTreeSet<usize>, frame: &Frame<'_>) {
+        let need = |slot: &usize| (self.fires[*slot].estimate.need(), *slot);
+        let mut due: Vec<_> = seen
             .iter()
-            .zip(slots)
-            .map(|(stray, slot)| match (stray, slot) {
-                (Some(stray), None) => tolerates(&mut self.fires[*stray]),
-                _ => false,
-            })
-            .collect()
+            .map(need)
+            .filter(|(need, _)| *need >= 1.0)
+            .collect();
+        due.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+        let mut looks = 0;
+        for (_, slot) in due {
+            if looks >= SOLVED_LOOKS {
+                break;
+            }
+            let estimate = &mut self.fires[slot].estimate;
+            estimate.solve(frame);
+            looks += estimate.looks();
+        }
+    }
+
+    /// What the best known fire has learned of the shared errors is what the next one begins with.
+    /// Which is best is told by how sure it is, not by what it says, so the choice bends nothing.
+    fn learn(&mut self, seen: &BTreeSet<usize>) {
+        let teaches =
+            |fire: &Fire| fire.is_confirmed() && fire.evidence.hits().is_multiple_of(TEACHES);
+        let taught = seen.iter().map(|slot| &self.fires[*slot]);
+        let taught = taught.filter(|fire| teaches(fire));
+        let taught = taught.map(|fire| fire.estimate.joint().known());
+        for known in taught {
+            if known.knows_more_than(&self.known) {
+                self.known = known;
+            }
+        }
     }
 
     /// Sightings that no fire and no other sighting explains begin a fire each.
     fn initiate(
         &mut self,
         slots: &[Option<usize>],
-        strays: &[bool],
         sightings: &[Classified],
-        view: &View<'_>,
-        terrain: Option<&dyn Terrain>,
+        frame: &Frame<'_>,
     ) -> Vec<Option<usize>> {
         let mut new = vec![None; sightings.len()];
-        if slots.iter().all(Option::is_some) {
-            return new;
-        }
-        let lens = self.lens(view);
-        let mut all_taken = Vec::new();
         for (index, classified) in sightings.iter().enumerate() {
             let is_free = slots[index].is_none()
-                && !strays[index]
                 && self.fires.len() < MAX_FIRES
-                && !self.is_explained(&lens, sightings, index, slots);
-            if !is_free {
-                continue;
-            }
-            if let Some((fire, taken)) = self.begin(classified, &lens, view, terrain) {
+                && !self.is_explained(frame, sightings, index, slots);
+            if let Some(fire) = is_free.then(|| self.begin(classified, frame)).flatten() {
                 new[index] = Some(self.fires.len());
-                all_taken.push((self.fires.len(), taken));
                 self.fires.push(fire);
             }
         }
-        self.absorb(&all_taken, &lens);
         new
     }
 
-    fn begin(
-        &mut self,
-        classified: &Classified,
-        lens: &Lens,
-        view: &View<'_>,
-        terrain: Option<&dyn Terrain>,
-    ) -> Option<(Fire, Taken)> {
+    fn begin(&mut self, classified: &Classified, frame: &Frame<'_>) -> Option<Fire> {
         let sighting = &classified.sighting;
-        let fix = fix(sighting, view, terrain);
-        let terrain_sigma = match (terrain, &fix) {
-            (Some(terrain), Some(fix)) => terrain.sigma_m(&fix.place),
-            (Some(terrain), None) => terrain.sigma_m(&view.pose.place),
-            (None, _) => 0.0,
-        };
-        let estimate = Estimate::unseen(sighting, lens, terrain_sigma, &self.common);
-        let taken = estimate.take(sighting, lens, view, terrain, &self.common, fix.as_ref())?;
+        let fix = fix(sighting, frame.view, frame.terrain);
+        let estimate = Estimate::begin(sighting, frame, fix.as_ref())?;
         let id = self.next;
         self.next = FireId(id.0.saturating_add(1));
-        let fire = Fire {
+        Some(Fire {
             id,
             class: classified.class,
             state: FireState::Suspected,
@@ -390,14 +390,13 @@ impl Tracker {
             merged_into: None,
             furthest_m: 0.0,
             strays: 0,
-        };
-        Some((fire, taken))
+        })
     }
 
     /// A sighting that another one of the frame, or a fire, already explains.
     fn is_explained(
         &self,
-        lens: &Lens,
+        frame: &Frame<'_>,
         sightings: &[Classified],
         index: usize,
         slots: &[Option<usize>],
@@ -410,12 +409,12 @@ impl Tracker {
                 && contains(&sightings[other].sighting, &this.sighting)
         };
         (0..sightings.len()).any(nested)
-            || (this.class == AlarmClass::Smoke && self.is_smoke_of_a_fire(lens, sightings, this))
+            || (this.class == AlarmClass::Smoke && self.is_smoke_of_a_fire(frame, sightings, this))
     }
 
     fn is_smoke_of_a_fire(
         &self,
-        lens: &Lens,
+        frame: &Frame<'_>,
         sightings: &[Classified],
         smoke: &Classified,
     ) -> bool {
@@ -427,10 +426,7 @@ impl Tracker {
             .fires
             .iter()
             .filter(|fire| fire.class == AlarmClass::Fire && fire.state != FireState::Out)
-            .filter_map(|fire| {
-                let state = fire.estimate.block().state(&self.common);
-                lens.predict(&fire.estimate.block().chart().distant(&state).0)
-            })
+            .filter_map(|fire| fire.estimate.predict(frame.lens))
             .map(|predicted| (predicted.pixel.u, predicted.pixel.v));
         seen.chain(known)
             .any(|(u, v)| is_near_box(&smoke.sighting, u, v))
@@ -443,6 +439,7 @@ impl Tracker {
         sightings: &[Classified],
         view: &View<'_>,
     ) {
+        let in_doubt = self.pairs.in_doubt(&self.fires);
         for (index, classified) in sightings.iter().enumerate() {
             if let Some(slot) = slots[index].or(new[index]) {
                 let fire = &mut self.fires[slot];
@@ -451,7 +448,8 @@ impl Tracker {
                 fire.evidence.hit(sighting.at, azimuth, classified.score);
                 fire.last_seen = sighting.at;
                 note_extent(fire, sighting, view);
-                advance(fire, &self.config);
+                let is_another = !in_doubt.contains(&fire.id);
+                advance(fire, &self.config, is_another);
             }
         }
     }
@@ -487,9 +485,7 @@ impl Tracker {
 
     /// Joins what looks have shown to be one fire (see [`Pairs`]).
     fn merge(&mut self, seen: &BTreeSet<usize>, glimpses: &[Glimpse], now: ServiceTime) {
-        let ones = self
-            .pairs
-            .look(&self.fires, glimpses, seen, &self.common, now);
+        let ones = self.pairs.look(&self.fires, glimpses, seen, now);
         for (elder, younger) in ones {
             let into = self.fires[elder].id;
             self.fires[younger].merged_into = Some(into);
@@ -528,41 +524,16 @@ impl Tracker {
     }
 }
 
-/// All rows that say something of the common errors, each with unit noise, as columns.
-fn stacked(taken: &[(usize, Taken)]) -> (DMatrix<f64>, DVector<f64>) {
-    let says = |taken: &Taken| {
-        (0..block::MEASURED)
-            .filter(|row| taken.measurement.says(*row))
-            .count()
-    };
-    let count = taken.iter().map(|(_, taken)| says(taken)).sum();
-    let mut columns = DMatrix::zeros(COMMON, count);
-    let mut residual = DVector::zeros(count);
-    let mut next = 0;
-    for (_, taken) in taken {
-        let told = &taken.told;
-        let rows = told.whitener * told.rows;
-        let left = told.whitener * told.residual;
-        for row in (0..block::MEASURED).filter(|row| taken.measurement.says(*row)) {
-            let to = columns.column_mut(next);
-            to.into_iter()
-                .zip(rows.row(row).iter())
-                .for_each(|(to, from)| *to = *from);
-            residual[next] = left[row];
-            next += 1;
-        }
-    }
-    (columns, residual)
-}
-
-/// Suspected to confirmed, and back from out, by what was seen.
-fn advance(fire: &mut Fire, config: &TrackConfig) {
+/// Suspected to confirmed, and back from out, by what was seen. One that may be another fire, which is
+/// told already, waits until both were seen at once, or turn out to be one.
+fn advance(fire: &mut Fire, config: &TrackConfig, is_another: bool) {
     let span_s = (fire.last_seen - fire.first_seen).as_secs_f64();
     let enough =
         fire.evidence.hits() >= config.confirm_sightings && span_s >= config.confirm_span_s;
     match fire.state {
         FireState::Suspected
             if enough
+                && is_another
                 && fire.evidence.is_convincing()
                 && fire.is_located()
                 && !fire.flicker.may_be_lamp(fire.size_m, fire.evidence.hits()) =>

@@ -1,12 +1,10 @@
 //! Two fires or one: evidence for pairs that lie within each other's error.
 
 use super::Fire;
-use super::block::ByState;
-use super::common::Common;
 use super::glimpse::Glimpse;
 use crate::alarm::{FireId, FireState};
-use emberfix_frames::ServiceTime;
-use nalgebra::SMatrix;
+use emberfix_frames::{ServiceTime, seconds};
+use nalgebra::Vector2;
 use std::collections::{BTreeMap, BTreeSet};
 
 /// What looks have said of pairs. Kept for pairs that were close in the image, as long as both live.
@@ -27,6 +25,10 @@ struct Odds {
 const ONE_SEEN: f64 = 0.9;
 /// A look in which both are seen: one fire does so when the detector splits it, one in twenty.
 const BOTH_SEEN: f64 = -3.0;
+/// One look in which both were seen leaves less than this.
+const IN_DOUBT: f64 = -1.0;
+/// No amount of old looks outweighs a long run of new ones.
+const SURELY_TWO: f64 = -20.0;
 /// 95 % for one.
 const IS_ONE: f64 = 3.0;
 /// Looks closer together than this are one, seconds.
@@ -45,21 +47,48 @@ impl Pairs {
         fires: &[Fire],
         glimpses: &[Glimpse],
         seen: &BTreeSet<usize>,
-        common: &Common,
         now: ServiceTime,
     ) -> Vec<(usize, usize)> {
+        self.note_both_seen(fires, seen, now);
         let mut ones = Vec::new();
         for (a, b) in near_pairs(fires, glimpses, seen) {
-            let both = seen.contains(&a) && seen.contains(&b);
-            if !both && distance(&fires[a], &fires[b], common) > GATE {
+            let ids = (fires[a.slot].id, fires[b.slot].id);
+            if seen.contains(&a.slot) && seen.contains(&b.slot) {
+                self.log_odds
+                    .entry(ids)
+                    .or_insert_with(|| Odds::unknown(now));
                 continue;
             }
-            let odds = self.note(fires[a].id, fires[b].id, both, now);
-            if odds >= IS_ONE {
-                ones.push((a, b));
+            let is_news =
+                are_two_boxes(a, b, fires) || are_one_place(&fires[a.slot], &fires[b.slot]);
+            if is_news && distance(a, b, fires) <= GATE && self.note(ids, ONE_SEEN, now) >= IS_ONE {
+                ones.push((a.slot, b.slot));
             }
         }
         ones
+    }
+
+    /// The younger ones of pairs of which the elder is told and that may still be one.
+    #[must_use]
+    pub fn in_doubt(&self, fires: &[Fire]) -> BTreeSet<FireId> {
+        let is_told = |id: &FireId| {
+            let at = fires.binary_search_by(|fire| fire.id.cmp(id));
+            at.is_ok_and(|at| fires[at].is_confirmed() && fires[at].state != FireState::Out)
+        };
+        let pairs = self.log_odds.iter();
+        pairs
+            .filter(|((elder, _), odds)| odds.for_one > IN_DOUBT && is_told(elder))
+            .map(|((_, younger), _)| *younger)
+            .collect()
+    }
+
+    /// Known pairs of which both are seen at once, unless that was settled long ago.
+    fn note_both_seen(&mut self, fires: &[Fire], seen: &BTreeSet<usize>, now: ServiceTime) {
+        let seen: BTreeSet<FireId> = seen.iter().map(|slot| fires[*slot].id).collect();
+        let both = |(a, b): &(FireId, FireId)| seen.contains(a) && seen.contains(b);
+        for (_, odds) in self.log_odds.iter_mut().filter(|(pair, _)| both(pair)) {
+            odds.add(BOTH_SEEN, now);
+        }
     }
 
     /// Forgets the pairs of fires that are no more.
@@ -69,25 +98,52 @@ impl Pairs {
             .retain(|(a, b), _| ids.contains(a) && ids.contains(b));
     }
 
-    fn note(&mut self, a: FireId, b: FireId, both: bool, now: ServiceTime) -> f64 {
-        let old = self.log_odds.get(&(a, b)).copied();
-        let since_s = old.map_or(LOOK_S, |old| (now - old.last_look).as_secs_f64());
-        let share = (since_s / LOOK_S).clamp(0.0, 1.0);
-        let told = if both { BOTH_SEEN } else { ONE_SEEN };
-        let for_one = old.map_or(0.0, |old| old.for_one) + told * share;
-        let odds = Odds {
-            for_one,
-            last_look: now,
-        };
-        self.log_odds.insert((a, b), odds);
-        for_one
+    fn note(&mut self, pair: (FireId, FireId), told: f64, now: ServiceTime) -> f64 {
+        let odds = self.log_odds.entry(pair);
+        let odds = odds.or_insert_with(|| Odds::unknown(now));
+        odds.add(told, now);
+        odds.for_one
     }
+}
+
+impl Odds {
+    fn unknown(now: ServiceTime) -> Self {
+        Self {
+            for_one: 0.0,
+            last_look: now - seconds(LOOK_S),
+        }
+    }
+
+    fn add(&mut self, told: f64, now: ServiceTime) {
+        let since_s = (now - self.last_look).as_secs_f64();
+        self.for_one += told * (since_s / LOOK_S).clamp(0.0, 1.0);
+        self.for_one = self.for_one.max(SURELY_TWO);
+        self.last_look = now;
+    }
+}
+
+/// Whether a detector would show two boxes, if these were two fires: those that hide each other say
+/// nothing when one box is seen.
+fn are_two_boxes(a: &Glimpse, b: &Glimpse, fires: &[Fire]) -> bool {
+    let width_px = extent_px(a, fires).max(extent_px(b, fires));
+    let off = (a.seen - b.seen).fixed_rows::<2>(0).amax();
+    off > 0.5 * width_px
+}
+
+/// Two that stand within each other's flames are one, whoever sees them from where.
+fn are_one_place(a: &Fire, b: &Fire) -> bool {
+    let apart_m = (a.estimate.position_m() - b.estimate.position_m()).norm();
+    apart_m < 0.5 * extent_m(a).min(extent_m(b))
 }
 
 /// Pairs (elder, younger) close in the image of which at least one was seen: those of which one was
 /// missed, and those with a young one, of which it is not settled yet whom it stands beside.
-fn near_pairs(fires: &[Fire], glimpses: &[Glimpse], seen: &BTreeSet<usize>) -> Vec<(usize, usize)> {
-    let open: Vec<&Glimpse> = glimpses
+fn near_pairs<'a>(
+    fires: &[Fire],
+    glimpses: &'a [Glimpse],
+    seen: &BTreeSet<usize>,
+) -> Vec<(&'a Glimpse, &'a Glimpse)> {
+    let open: Vec<&'a Glimpse> = glimpses
         .iter()
         .filter(|glimpse| fires[glimpse.slot].state != FireState::Out)
         .collect();
@@ -96,48 +152,61 @@ fn near_pairs(fires: &[Fire], glimpses: &[Glimpse], seen: &BTreeSet<usize>) -> V
     };
     let mut by_column = open.clone();
     by_column.sort_by(|a, b| a.seen.x.total_cmp(&b.seen.x));
-    let mut pairs = BTreeSet::new();
+    let widest = open
+        .iter()
+        .map(|g| reach_px(g, fires).x)
+        .fold(0.0, f64::max);
+    let mut pairs = BTreeMap::new();
     for glimpse in open.iter().filter(|glimpse| asks(glimpse)) {
-        let from = by_column.partition_point(|other| other.seen.x < glimpse.seen.x - NEAR_PX);
+        let own = reach_px(glimpse, fires);
+        let reach = (own.x + widest).min(NEAR_PX);
+        let from = by_column.partition_point(|other| other.seen.x < glimpse.seen.x - reach);
         let near = by_column[from..]
             .iter()
-            .take_while(|other| other.seen.x <= glimpse.seen.x + NEAR_PX)
-            .filter(|other| (other.seen.y - glimpse.seen.y).abs() <= NEAR_PX);
+            .take_while(|other| other.seen.x <= glimpse.seen.x + reach)
+            .filter(|other| {
+                let (off, reach) = (other.seen - glimpse.seen, own + reach_px(other, fires));
+                off.x.abs() <= reach.x && off.y.abs() <= reach.y.min(NEAR_PX)
+            });
         for other in near.filter(|other| other.slot != glimpse.slot) {
             let (a, b) = (glimpse.slot, other.slot);
             let one_seen = seen.contains(&a) || seen.contains(&b);
             if one_seen && fires[a].class == fires[b].class {
-                pairs.insert((a.min(b), a.max(b)));
+                let pair = if a < b {
+                    (*glimpse, *other)
+                } else {
+                    (*other, *glimpse)
+                };
+                pairs.insert((a.min(b), a.max(b)), pair);
             }
         }
     }
-    pairs.into_iter().collect()
+    pairs.into_values().collect()
 }
 
-/// Squared Mahalanobis distance, horizontal, between two fires. They have the common errors in
-/// common, and their own extent: two boxes on one wide fire need not have the same base.
-fn distance(a: &Fire, b: &Fire, common: &Common) -> f64 {
-    let [slope_a, slope_b] = [a, b].map(|fire| {
-        let estimate = &fire.estimate;
-        estimate.block().chart().position_by_state(estimate.state())
-    });
-    let by =
-        |fire: &Fire, slope: &ByState| slope.fixed_rows::<2>(0) * fire.estimate.block().by_common();
-    let own = |fire: &Fire, slope: &ByState| {
-        slope.fixed_rows::<2>(0)
-            * fire.estimate.block().own()
-            * slope.fixed_rows::<2>(0).transpose()
-    };
-    let apart = by(a, &slope_a) - by(b, &slope_b);
-    let mut with_common = SMatrix::<f64, 2, { super::COMMON }>::zeros();
-    with_common.gemm(1.0, &apart, common.covariance(), 0.0);
-    let extent_m = extent_m(a).max(extent_m(b));
-    let extent = nalgebra::Matrix2::identity() * (0.25 * extent_m * extent_m);
-    let spread = with_common * apart.transpose() + own(a, &slope_a) + own(b, &slope_b) + extent;
-    let off = (a.estimate.position_m() - b.estimate.position_m()).xy();
+/// Squared Mahalanobis distance between where two fires should be seen: what both were seen through
+/// cancels there. Two boxes on one wide fire need not have the same base.
+fn distance(a: &Glimpse, b: &Glimpse, fires: &[Fire]) -> f64 {
+    let extent_px = extent_px(a, fires).max(extent_px(b, fires));
+    let mut spread = a.spread + b.spread;
+    for axis in 0..2 {
+        spread[(axis, axis)] += 0.25 * extent_px * extent_px;
+    }
+    let off = a.seen - b.seen;
     spread
         .cholesky()
         .map_or(f64::INFINITY, |spread| off.dot(&spread.solve(&off)))
+}
+
+/// Beyond the reaches of both, two are further apart than [`GATE`] allows: columns, rows.
+fn reach_px(glimpse: &Glimpse, fires: &[Fire]) -> Vector2<f64> {
+    let extent_px = 0.5 * extent_px(glimpse, fires);
+    let variances = Vector2::new(glimpse.spread[(0, 0)], glimpse.spread[(1, 1)]);
+    variances.map(|variance| (GATE * (variance + extent_px * extent_px)).sqrt())
+}
+
+fn extent_px(glimpse: &Glimpse, fires: &[Fire]) -> f64 {
+    glimpse.px_per_m * extent_m(&fires[glimpse.slot])
 }
 
 fn extent_m(fire: &Fire) -> f64 {

@@ -1,6 +1,6 @@
 //! What is known of the errors that all fires share, in SI units.
 
-use super::common::Common;
+use super::joint::{Known, LASTING};
 use crate::locate::{SHARED, Shared, View};
 use emberfix_frames::{Vector3, rotation_matrix};
 use nalgebra::SVector;
@@ -51,13 +51,13 @@ impl Estimated {
 impl SharedErrors {
     /// As the tracker knows them after a frame.
     #[must_use]
-    pub fn read_off(common: &Common, view: &View<'_>) -> Self {
+    pub fn read_off(known: &Known, view: &View<'_>) -> Self {
         let along = |weights: &[(usize, f64)]| {
             let mut by = SVector::<f64, SHARED>::zeros();
             for (index, weight) in weights {
                 by[*index] = weight * view.sigmas()[*index];
             }
-            estimated(&by, common)
+            estimated(&by, known)
         };
         let one = |index: usize| along(&[(index, 1.0)]);
         let three = |from: Shared| std::array::from_fn(|axis| one(from as usize + axis));
@@ -89,11 +89,13 @@ impl SharedErrors {
     }
 }
 
-fn estimated(by: &SVector<f64, SHARED>, common: &Common) -> Estimated {
-    let covariance = common.covariance().fixed_view::<SHARED, SHARED>(0, 0);
+fn estimated(by: &SVector<f64, SHARED>, known: &Known) -> Estimated {
+    let lasting = by.fixed_rows::<LASTING>(0);
     Estimated {
-        value: by.dot(&common.now()),
-        sigma: (by.transpose() * covariance * by)[0].max(0.0).sqrt(),
+        value: lasting.dot(&known.mean),
+        sigma: (lasting.transpose() * known.covariance * lasting)[0]
+            .max(0.0)
+            .sqrt(),
         prior_sigma: by.norm(),
     }
 }

@@ -292,3 +292,62 @@ fn a_fire_that_is_gone_ends_and_a_single_flash_is_forgotten() {
     }
     assert!(flash.fires().is_empty());
 }
+
+/// 50 px off, where a box's edge is known to 2 px and the camera's direction to 0.01 rad or 9 px: given to
+/// the only fire there is, it must move it by a part of its error only, and begin no other.
+#[test]
+fn a_sighting_that_strays_is_given_to_its_fire_and_hardly_moves_it() {
+    let mut flight = Flight::new(Path::Orbit, 4);
+    let mut tracker = Tracker::new(TrackConfig::default(), FireId(1));
+    let mut look = |tracker: &mut Tracker, i: usize, off_px: f64| {
+        let t_s = 0.33 * i as f64;
+        let truth = flight.true_pose(t_s);
+        let mut seen = flight.sight(&truth).unwrap();
+        seen.sighting.base.u += off_px;
+        seen.sighting.disparity = None;
+        let reported = flight.reported(t_s);
+        let datum = datum();
+        let motion = |later_s: f64| Some(flight.told(t_s + later_s));
+        let view = View::new(&flight.rig, &reported, &PRIORS, &datum).with_motion(&motion);
+        tracker.step(&view, &[seen], None)
+    };
+    for i in 0..60 {
+        look(&mut tracker, i, 0.0);
+    }
+    let before = tracker.fires()[0].clone();
+    let given = look(&mut tracker, 60, 50.0);
+    assert_eq!(given[0].fire, Some(FireId(1)));
+    assert_eq!(tracker.fires().len(), 1);
+    let moved = tracker.fires()[0].position().metres() - before.position().metres();
+    let sigma = before.covariance().m2().trace().sqrt();
+    assert!(moved.norm() < 0.2 * sigma, "moved {moved} of {sigma}");
+}
+
+/// What the first fire has shown of the clock, the second one begins with.
+#[test]
+fn a_new_fire_begins_with_what_the_best_known_one_has_learned() {
+    let (tracker, _) = fly(Path::Orbit, 6, 60);
+    let learned = tracker.shared_errors().unwrap().clock_s;
+    assert!(learned.is_found(), "{learned:?}");
+    let known = tracker.fires()[0].estimate.joint().known();
+    let clock = Shared::Clock as usize;
+    assert!(known.covariance[(clock, clock)].sqrt() < 0.5);
+}
+
+/// Sightings as said: a variance of 1, give or take the slow average of 60 numbers. Twice the sigmas: 4.
+#[test]
+fn noise_that_was_understated_is_noticed_and_never_overstated_noise() {
+    let scatter = |variance: f64| {
+        let mut dice = Dice(ChaCha8Rng::seed_from_u64(3));
+        let mut scatter = Scatter::default();
+        for _ in 0..600 {
+            let sigma = (variance / scatter.variance()).sqrt();
+            let squared: f64 = (0..3).map(|_| dice.normal(sigma).powi(2)).sum();
+            scatter.note(squared / 3.0);
+        }
+        scatter.variance()
+    };
+    assert!((1.0..1.4).contains(&scatter(1.0)));
+    assert!((scatter(0.3) - 1.0).abs() < 1e-9);
+    assert!((2.8..5.6).contains(&scatter(4.0)), "{}", scatter(4.0));
+}

@@ -6,9 +6,7 @@ use super::flight::{Course, Kind, log_uniform};
 use super::law::{Draw, Law};
 use super::printed::printed;
 use super::score::{Scored, score};
-use super::truth::{
-    Autopilot, ErrorModel, Flame, Gnss, Lens, Seen, Slow, TrueCamera, slow, wander,
-};
+use super::truth::{Autopilot, ErrorModel, Flame, Gnss, Lens, Seen, TrueCamera, slow, wander};
 use emberfix_frames::{Covariance, MissionEnu};
 use emberfix_sim::noise::{normal, stream};
 use emberfix_sim::state::BodyState;
@@ -151,14 +149,9 @@ pub struct Scene<'a> {
 /// Plays a scene: errors wander, the camera looks, the autopilot reports.
 pub fn stage<'a>(scene: &Scene<'a>, rng: &mut ChaCha8Rng) -> Staged<'a> {
     let wandered = wander(rng, scene.errors, scene.times_s, scene.law);
-    stage_with(scene, &wandered, rng)
-}
-
-/// The same with slow errors that are given.
-pub fn stage_with<'a>(scene: &Scene<'a>, wandered: &[Slow], rng: &mut ChaCha8Rng) -> Staged<'a> {
     let mut draw = Draw::new(stream(rng.random(), "looks"), scene.law);
     let mut looks = Vec::with_capacity(scene.times_s.len());
-    for (t_s, slow) in scene.times_s.iter().zip(wandered) {
+    for (t_s, slow) in scene.times_s.iter().zip(&wandered) {
         let state = scene.course.state(*t_s);
         let camera = TrueCamera {
             lens: &scene.lens,
