@@ -2,6 +2,7 @@
 //! at once.
 
 use super::screens::config::{self as screens, RawScreens, ScreensConfig};
+use super::doors::{self, Doors, RawDoors};
 use emberfix_calib::{KeyProblem, toml_problem, unknown_keys};
 use emberfix_mav::{LinkUrl, LinkUrlError};
 use serde::Deserialize;
@@ -61,6 +62,7 @@ pub struct GroundConfig {
     pub(super) mavlink: Option<MavlinkConfig>,
     pub(super) uavs: Vec<Uav>,
     pub(super) screens: ScreensConfig,
+    pub(super) doors: Doors,
 }
 
 /// The ground agent's end of MAVLink.
@@ -82,8 +84,7 @@ pub(super) struct Uav {
 struct RawConfig {
     #[serde(default = "default_listen")]
     listen: String,
-    #[serde(default)]
-    allow_remote: bool,
+    allow_remote: Option<bool>,
     #[serde(default)]
     host_names: Vec<String>,
     data_dir: PathBuf,
@@ -94,6 +95,8 @@ struct RawConfig {
     uav: Vec<RawUav>,
     #[serde(flatten)]
     screens: RawScreens,
+    #[serde(flatten)]
+    doors: RawDoors,
 }
 
 #[derive(Deserialize)]
@@ -166,7 +169,8 @@ impl GroundConfig {
             })
         };
         let table: toml::Table = toml::from_str(text).map_err(syntax)?;
-        let mut problems: Vec<String> = unknown_keys(&table, &[KNOWN, screens::KNOWN].concat())
+        let known = [KNOWN, screens::KNOWN, doors::KNOWN].concat();
+        let mut problems: Vec<String> = unknown_keys(&table, &known)
             .iter()
             .map(KeyProblem::to_string)
             .collect();
@@ -191,10 +195,17 @@ fn check(
     problems: &mut Vec<String>,
 ) -> Option<GroundConfig> {
     let listen = overrides.listen.or_else(|| address(&raw.listen, problems));
-    if let Some(address) = listen {
-        check_door(address, raw.allow_remote, problems);
-    }
     let folder = path.parent().unwrap_or(Path::new(""));
+    let doors = raw.doors.check(folder, problems);
+    if let Some(address) = listen {
+        doors.check_address(address, problems);
+    }
+    if raw.allow_remote.is_some() {
+        problems.push(
+            "allow_remote is no longer read: beyond this machine the station needs [tls] and [[access]]"
+                .to_owned(),
+        );
+    }
     let mut mavlink = raw.mavlink;
     if let Some(url) = overrides.mavlink_url {
         let (system_id, component_id) = mavlink.map_or_else(
@@ -221,6 +232,7 @@ fn check(
         mavlink,
         uavs,
         screens,
+        doors,
     })
 }
 
@@ -232,16 +244,6 @@ fn address(text: &str, problems: &mut Vec<String>) -> Option<SocketAddr> {
         ));
     }
     parsed
-}
-
-/// Whoever reaches the address may post alarms, so by default only this machine may.
-fn check_door(address: SocketAddr, allow_remote: bool, problems: &mut Vec<String>) {
-    if !address.ip().is_loopback() && !allow_remote {
-        problems.push(format!(
-            "listen is {address}, allowed is a loopback address: anyone who reaches it could post \
-             alarms; set allow_remote = true when the network itself is guarded (a VPN)"
-        ));
-    }
 }
 
 fn check_mavlink(raw: RawMavlink, problems: &mut Vec<String>) -> Option<MavlinkConfig> {
@@ -321,7 +323,7 @@ mod tests {
         for part in [
             "conf/ground.toml",
             "did you mean listen",
-            "allow_remote = true",
+            "[[access]]",
             "1 to 255",
             "uav.system_id is 0",
         ] {
@@ -348,6 +350,31 @@ mod tests {
         };
         let refused = GroundConfig::parse("data_dir='d'", Path::new("g.toml"), overrides);
         assert!(matches!(refused, Err(ConfigError::Values { .. })));
-        assert!(parse("data_dir='d'\nlisten='0.0.0.0:8470'\nallow_remote=true").is_ok());
+        let allowed = parse("data_dir='d'\nlisten='0.0.0.0:8470'\nallow_remote=true").unwrap_err();
+        assert!(allowed.contains("no longer read") && allowed.contains("ground-remote.toml"));
+    }
+
+    #[test]
+    fn every_problem_of_the_doors_is_named_at_once() {
+        let text = "data_dir='d'\nlisten='0.0.0.0:1'\nstore='mysql://x:secret@y'\n\
+                    [tls]\ncertificate='no.pem'\nkey='no.key'\n\
+                    [[access]]\nname='a'\nrole='king'\ntoken_sha256='12'\n\
+                    [limits]\nconnections=0\nhead_s=nan\n\
+                    [bus]\nurl='http://x'\nstation='a b'\nreplicas=9";
+        let message = parse(text).unwrap_err();
+        for part in [
+            "tls.certificate conf/no.pem",
+            "\"king\", allowed are aircraft, screen, operator",
+            "64 hexadecimal digits",
+            "store is no PostgreSQL address",
+            "limits.connections is 0",
+            "limits.head_s is NaN",
+            "bus.url is \"http://x\"",
+            "bus.station is \"a b\"",
+            "bus.replicas is 9",
+        ] {
+            assert!(message.contains(part), "{part:?} is not in {message}");
+        }
+        assert!(!message.contains("secret"), "{message}");
     }
 }

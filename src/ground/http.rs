@@ -6,11 +6,11 @@
 
 mod incidents;
 
+use super::access::{self, Access, Caller, Doorkeeper};
 use super::events::{self, MAX_STREAMS, Show};
 use super::store::{Completeness, Kept, StoreError};
 use super::tracks::Source;
 use super::{Ping, ReceiveError, Station, lock, now};
-use axum::Router;
 use axum::body::Bytes;
 use axum::extract::rejection::BytesRejection;
 use axum::extract::{DefaultBodyLimit, Query, Request, State};
@@ -19,6 +19,7 @@ use axum::middleware::{self, Next};
 use axum::response::sse::{KeepAlive, Sse};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
+use axum::{Extension, Router};
 use serde::Deserialize;
 use serde_json::json;
 use std::net::IpAddr;
@@ -37,7 +38,13 @@ const PAGE: u32 = 512;
 
 type Shared = State<Arc<Station>>;
 
-pub(super) fn router(station: Arc<Station>, host_names: Arc<[String]>) -> Router {
+pub(super) fn router(
+    station: Arc<Station>,
+    host_names: Arc<[String]>,
+    accesses: Vec<Access>,
+) -> Router {
+    let keeper = Arc::new(Doorkeeper::new(accesses));
+    let counting = Arc::clone(&station);
     Router::new()
         .merge(super::page::routes())
         .merge(super::screens::routes())
@@ -59,8 +66,45 @@ pub(super) fn router(station: Arc<Station>, host_names: Arc<[String]>) -> Router
         .with_state(station)
         .layer(DefaultBodyLimit::max(MAX_BODY))
         .layer(middleware::from_fn(in_time))
+        .layer(middleware::from_fn_with_state(keeper, access::admit))
         .layer(middleware::from_fn_with_state(host_names, only_for_us))
         .layer(middleware::map_response(guarded))
+        .layer(middleware::from_fn_with_state(counting, count_refusals))
+}
+
+/// What was refused, by status, for `/health`.
+async fn count_refusals(State(station): Shared, request: Request, next: Next) -> Response {
+    let response = next.run(request).await;
+    let status = response.status();
+    if status.is_client_error() || status.is_server_error() {
+        *lock(&station.refusals).entry(status.as_u16()).or_default() += 1;
+    }
+    response
+}
+
+/// Refuses an aircraft that speaks in another's name.
+fn speaks(caller: &Caller, body: &[u8]) -> Option<Response> {
+    #[derive(Deserialize)]
+    struct Named {
+        uav: String,
+    }
+    #[derive(Deserialize)]
+    struct Alarm {
+        properties: Named,
+    }
+    let Caller::Known(access) = caller else {
+        return None;
+    };
+    let alarm = serde_json::from_slice::<Alarm>(body).map(|alarm| alarm.properties);
+    let named = alarm.or_else(|_| serde_json::from_slice::<Named>(body));
+    match named {
+        // What names nobody is refused where it is read.
+        Ok(named) if !caller.speaks_for(&named.uav) => {
+            let reason = format!("{} does not speak for {:?}", access.name, named.uav);
+            Some(refusal(StatusCode::FORBIDDEN, reason))
+        }
+        _ => None,
+    }
 }
 
 pub(super) fn refusal(status: StatusCode, reason: impl std::fmt::Display) -> Response {
@@ -181,6 +225,7 @@ fn json_body(headers: &HeaderMap, body: Result<Bytes, BytesRejection>) -> Result
 
 async fn post_alarm(
     State(station): Shared,
+    Extension(caller): Extension<Caller>,
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Response {
@@ -191,6 +236,9 @@ async fn post_alarm(
             return error.answer();
         }
     };
+    if let Some(refused) = speaks(&caller, &body) {
+        return refused;
+    }
     let (alarm, kept) = match station.receive(&body, LINK_NAME, Completeness::Full).await {
         Ok(received) => received,
         Err(error) => return not_taken(&error),
@@ -207,6 +255,7 @@ async fn post_alarm(
 /// An alarm that is only a test: checked as a real one and shown as a test, kept nowhere.
 async fn post_test(
     State(station): Shared,
+    Extension(caller): Extension<Caller>,
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Response {
@@ -214,6 +263,9 @@ async fn post_test(
         Ok(body) => body,
         Err(error) => return error.answer(),
     };
+    if let Some(refused) = speaks(&caller, &body) {
+        return refused;
+    }
     match station.test(&body, LINK_NAME) {
         Ok(alarm) => {
             let properties = alarm.properties;
@@ -236,6 +288,7 @@ fn not_taken(error: &ReceiveError) -> Response {
 
 async fn post_track(
     State(station): Shared,
+    Extension(caller): Extension<Caller>,
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Response {
@@ -243,6 +296,9 @@ async fn post_track(
         Ok(body) => body,
         Err(error) => return error.answer(),
     };
+    if let Some(refused) = speaks(&caller, &body) {
+        return refused;
+    }
     match Ping::from_json(&body).and_then(|ping| station.moved(ping, Source::Service)) {
         Ok(()) => StatusCode::NO_CONTENT.into_response(),
         Err(error) => refusal(StatusCode::BAD_REQUEST, error),
@@ -333,6 +389,9 @@ async fn health(State(station): Shared) -> Response {
         "waiting": station.writer.waiting(),
         "streams": counters.streams.load(Ordering::Relaxed),
         "mavlink": mavlink,
+        "bus": station.bus,
+        "turned_away": &*station.turned,
+        "refused_by_status": lock(&station.refusals).clone(),
         "aircraft": aircraft,
     }))
     .into_response()

@@ -13,7 +13,7 @@ use emberfix_frames::{Covariance, MissionEnu, ServiceTime, Wgs84, Wgs84Parts};
 use serde::Serialize;
 use serde_json::{Value, json};
 use std::collections::BTreeSet;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 /// One fire as the ground knows it. Serialised by [`Incident::to_geojson`].
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -65,6 +65,18 @@ pub struct Incident {
     pub degraded: Vec<String>,
     /// Set by the station's configuration: nothing of this is real.
     pub exercise: bool,
+    #[serde(skip)]
+    text: Text,
+}
+
+/// The feature as text, made once for all who show it.
+#[derive(Debug, Clone, Default)]
+struct Text(OnceLock<Arc<str>>);
+
+impl PartialEq for Text {
+    fn eq(&self, _: &Self) -> bool {
+        true // it follows from the rest
+    }
 }
 
 /// One alarm of an incident.
@@ -205,6 +217,7 @@ impl Incident {
             history: about.history,
             chip: about.chip,
             exercise: about.exercise,
+            text: Text::default(),
         })
     }
 
@@ -228,6 +241,13 @@ impl Incident {
     pub fn aircraft(&self) -> impl Iterator<Item = &str> {
         let names: BTreeSet<&str> = self.alarms.iter().map(|alarm| alarm.uav.as_str()).collect();
         names.into_iter()
+    }
+
+    /// The same as text on one line, made once.
+    #[must_use]
+    pub fn feature(&self) -> Arc<str> {
+        let text = || self.to_geojson().to_string().into();
+        Arc::clone(self.text.0.get_or_init(text))
     }
 
     /// The incident as a GeoJSON Feature.

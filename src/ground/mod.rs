@@ -15,8 +15,9 @@
 //! acknowledged again and changes nothing; an older revision never replaces a newer one; a summary
 //! that came over MAVLink never replaces the whole alarm of the same revision.
 //!
-//! **Assumptions.** Whoever can reach the address may post: there is no authentication yet, so it
-//! must be a loopback address unless the configuration says `allow_remote = true`.
+//! **Doors.** A loopback address serves everyone on the machine. Any other needs TLS and tokens or client
+//! certificates ([`access`]: aircraft post, screens read, operators act). What is refused is counted in
+//! `/health`.
 //!
 //! **Ways inside.** What comes goes through one queue to one [`writer`], which keeps the book
 //! ([`book`]: who is one fire with whom), commits a batch with one sync, and only then answers and
@@ -24,19 +25,26 @@
 //!
 //! **Known limits.** Aircraft tracks live in memory ([`tracks::MAX_POINTS`] points each) and start anew with the process.
 
+mod access;
 pub mod action;
+#[cfg(test)]
+mod attackers;
 mod board;
 mod book;
+mod bus;
+#[cfg(test)]
+mod bus_tests;
 pub mod chips;
 pub mod config;
+mod doors;
 mod events;
 mod http;
 pub mod incident;
-mod listener;
 mod mavlink;
 mod merge;
 mod page;
 mod screens;
+mod server;
 pub mod store;
 #[cfg(test)]
 mod tests;
@@ -53,15 +61,19 @@ pub use writer::{Done, Order, OrderError};
 
 use crate::alarm::{Alarm, AlarmError};
 use board::Board;
+use bus::BusHealth;
 use chips::Chips;
 use emberfix_frames::{CovarianceError, ServiceTime};
 use emberfix_mav::{Link, LinkError};
 use screens::Screens;
+use server::{Door, Turned};
+use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLockReadGuard};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use store::postgres::Postgres;
 use store::sqlite::Sqlite;
 use store::{Completeness, Delivery, Kept, Store};
 use tokio::sync::{broadcast, watch};
@@ -109,6 +121,12 @@ pub enum GroundError {
         #[from]
         source: foxglove::FoxgloveError,
     },
+    /// Certificate or key can't be read any more.
+    #[error("{reason}")]
+    Tls {
+        /// Which, and why.
+        reason: String,
+    },
     /// The MAVLink port can't be opened.
     #[error(transparent)]
     Mavlink(#[from] LinkError),
@@ -153,10 +171,15 @@ pub enum ReceiveError {
 pub async fn run(config: &Path, overrides: Overrides) -> Result<(), GroundError> {
     let config = GroundConfig::load(config, overrides)?;
     let data_dir = config.data_dir.clone();
+    let scheme = if config.doors.tls.is_some() {
+        "https"
+    } else {
+        "http"
+    };
     let ground = Ground::start(config).await?;
     // The line that people and programs wait for; with port 0 only it knows the port.
     eprintln!(
-        "emberfix ground: http://{} keeps alarms in {}",
+        "emberfix ground: {scheme}://{} keeps alarms in {}",
         ground.address(),
         data_dir.display()
     );
@@ -188,7 +211,11 @@ impl Ground {
     /// # Errors
     /// [`GroundError`] when the store or the address can't be opened.
     pub async fn start(config: GroundConfig) -> Result<Self, GroundError> {
-        let station = Arc::new(Station::open(&config)?);
+        let door = door(&config)?;
+        let station = Arc::new(Station::open(&config, Arc::clone(&door.turned)).await?);
+        if let Some(bus) = config.doors.bus.clone() {
+            tokio::spawn(bus::run(Arc::clone(&station), bus));
+        }
         if let Some(mavlink) = config.mavlink {
             let link = Link::open(&mavlink.url).await?;
             tokio::spawn(mavlink::run(
@@ -208,14 +235,9 @@ impl Ground {
             .map_err(in_use)?;
         let address = socket.local_addr().map_err(in_use)?;
         let names = Arc::from(config.host_names.as_slice());
-        let app = http::router(Arc::clone(&station), names);
-        let mut stopping = station.stopping.subscribe();
-        let server = axum::serve(
-            listener::Bounded::new(socket, listener::Limits::default()),
-            app,
-        )
-        .with_graceful_shutdown(async move { drop(stopping.wait_for(|stop| *stop).await) });
-        let server = tokio::spawn(async move { server.await });
+        let app = http::router(Arc::clone(&station), names, config.doors.accesses);
+        let server = server::serve(socket, app, door, station.stopping.subscribe());
+        let server = tokio::spawn(server);
         Ok(Self {
             address,
             station,
@@ -253,6 +275,17 @@ impl Ground {
     }
 }
 
+fn door(config: &GroundConfig) -> Result<Door, GroundError> {
+    let acceptor = config.doors.tls.as_ref().map(doors::TlsFiles::acceptor);
+    Ok(Door {
+        limits: config.doors.limits,
+        tls: acceptor
+            .transpose()
+            .map_err(|reason| GroundError::Tls { reason })?,
+        turned: Arc::default(),
+    })
+}
+
 fn served(ended: Result<std::io::Result<()>, tokio::task::JoinError>) -> Result<(), GroundError> {
     let source = match ended {
         Ok(Ok(())) => return Ok(()),
@@ -286,6 +319,11 @@ pub(crate) struct Station {
     stopping: watch::Sender<bool>,
     counters: Counters,
     mavlink: Mutex<Option<mavlink::LinkHealth>>,
+    bus: BusHealth,
+    /// Connections that were turned away.
+    turned: Arc<Turned>,
+    /// Requests that were refused, by HTTP status.
+    refusals: Mutex<BTreeMap<u16, u64>>,
 }
 
 #[derive(Debug, Default)]
@@ -297,8 +335,19 @@ struct Counters {
 }
 
 impl Station {
-    fn open(config: &GroundConfig) -> Result<Self, GroundError> {
-        let store: Arc<dyn Store> = Arc::new(Sqlite::open(&config.data_dir)?);
+    async fn open(config: &GroundConfig, turned: Arc<Turned>) -> Result<Self, GroundError> {
+        let config = config.clone();
+        tokio::task::spawn_blocking(move || Self::open_here(&config, turned))
+            .await
+            .unwrap_or(Err(StoreError::Stopped.into()))
+    }
+
+    /// Blocks.
+    fn open_here(config: &GroundConfig, turned: Arc<Turned>) -> Result<Self, GroundError> {
+        let store: Arc<dyn Store> = match &config.doors.postgres {
+            Some(url) => Arc::new(Postgres::open(url)?),
+            None => Arc::new(Sqlite::open(&config.data_dir)?),
+        };
         let chips = Arc::new(Mutex::new(Chips::open(config.data_dir.join("chips"))?));
         let seen = Arc::clone(&chips);
         let has_chip = Box::new(move |alarm: &str| lock(&seen).has(alarm));
@@ -314,6 +363,9 @@ impl Station {
             stopping: watch::Sender::new(false),
             counters: Counters::default(),
             mavlink: Mutex::default(),
+            bus: BusHealth::default(),
+            turned,
+            refusals: Mutex::default(),
         })
     }
 

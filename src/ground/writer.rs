@@ -181,7 +181,6 @@ impl Writer {
         let _ = self.jobs.try_send(Job::Chip { alarm });
     }
 
-    #[expect(dead_code, reason = "the bus comes next")]
     /// Notes where the bus is.
     ///
     /// # Errors
@@ -720,7 +719,7 @@ fn of_incident(incident: &Incident) -> Standing {
         longitude_deg: incident.place.longitude_deg(),
         first_seen_at: incident.first_seen_at,
         captured_at: incident.captured_at,
-        feature: incident.to_geojson().to_string(),
+        feature: incident.feature().to_string(),
     }
 }
 

@@ -1,10 +1,12 @@
 //! Incidents, their history and images, and what operators do with them.
 
 use super::{Shared, geojson, json_body, refusal};
+use crate::ground::access::Caller;
 use crate::ground::action::{Action, Kind};
 use crate::ground::store::{HistoryRow, Search, StoreError};
 use crate::ground::writer::{Order, OrderError};
 use crate::ground::{ChipError, Incident, News, Station, now};
+use axum::Extension;
 use axum::body::Bytes;
 use axum::extract::rejection::{BytesRejection, QueryRejection};
 use axum::extract::{Path, Query, State};
@@ -119,7 +121,7 @@ fn standing(station: &Station) -> Vec<String> {
     let incidents = station.incidents();
     incidents
         .iter()
-        .map(|incident| incident.to_geojson().to_string())
+        .map(|incident| incident.feature().to_string())
         .collect()
 }
 
@@ -234,9 +236,17 @@ pub(super) async fn chip(State(station): Shared, Path(id): Path<String>) -> Resp
 pub(super) async fn take_chip(
     State(station): Shared,
     Path((alarm, revision)): Path<(String, u32)>,
+    Extension(caller): Extension<Caller>,
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Response {
+    let uav = alarm.rsplit_once('-').map_or("", |(uav, _)| uav);
+    if !caller.speaks_for(uav) {
+        return refusal(
+            StatusCode::FORBIDDEN,
+            format!("{alarm:?} is another aircraft's alarm"),
+        );
+    }
     let kind = headers.get(header::CONTENT_TYPE);
     if kind.is_none_or(|kind| kind != "image/jpeg") {
         let reason = "Content-Type of an image is image/jpeg";
@@ -267,7 +277,7 @@ struct RawOrder {
 }
 
 impl RawOrder {
-    fn check(self, incident: String) -> Result<Order, AskError> {
+    fn check(self, incident: String, caller: &Caller) -> Result<Order, AskError> {
         length("by", Some(&self.by), MAX_NAME, "1 to 64 characters")?;
         length("id", self.id.as_ref(), MAX_NAME, "1 to 64 characters")?;
         length("with", self.with.as_ref(), MAX_NAME, "1 to 64 characters")?;
@@ -277,7 +287,11 @@ impl RawOrder {
             kind: self.kind,
             incident,
             with: self.with,
-            by: self.by,
+            // Whose token it was is on record, whatever the hand that used it calls itself.
+            by: match caller.name() {
+                Some(name) if name != self.by => format!("{} ({name})", self.by),
+                _ => self.by,
+            },
             note: self.note,
             at: now(),
         })
@@ -304,6 +318,7 @@ fn length(
 pub(super) async fn act(
     State(station): Shared,
     Path(id): Path<String>,
+    Extension(caller): Extension<Caller>,
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Response {
@@ -312,7 +327,7 @@ pub(super) async fn act(
         Err(error) => return error.answer(),
     };
     let raw = serde_json::from_slice::<RawOrder>(&body).map_err(AskError::from);
-    let order = match raw.and_then(|raw| raw.check(id)) {
+    let order = match raw.and_then(|raw| raw.check(id, &caller)) {
         Ok(order) => order,
         Err(error) => return refusal(StatusCode::BAD_REQUEST, error),
     };
@@ -356,12 +371,19 @@ pub(super) struct Fetch {
 /// comes after N says that everything up to N has arrived.
 pub(super) async fn for_aircraft(
     State(station): Shared,
+    Extension(caller): Extension<Caller>,
     query: Result<Query<Fetch>, QueryRejection>,
 ) -> Response {
     let Fetch { uav, after } = match query {
         Ok(Query(fetch)) => fetch,
         Err(error) => return refusal(StatusCode::BAD_REQUEST, error),
     };
+    if !caller.speaks_for(&uav) {
+        return refusal(
+            StatusCode::FORBIDDEN,
+            format!("{uav:?} is another aircraft"),
+        );
+    }
     let asked = uav.clone();
     let told = station
         .with_store(move |store| store.actions_for(&asked, after, MAX_ACTIONS))

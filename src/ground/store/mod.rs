@@ -1,9 +1,13 @@
 //! What the ground knows, on disk: every alarm revision as it came, every incident as it stands,
-//! every operator's action. One trait, [`Store`]; [`sqlite`] is built in.
+//! every operator's action. One trait, [`Store`]; [`sqlite`] is built in, [`postgres`] takes its place
+//! by one line of the configuration. Both pass the same tests.
 //!
 //! When [`Store::commit`] returns, its batch survives a power cut (as far as disk and server keep
 //! their promises), or nothing of it was kept.
 
+pub mod postgres;
+#[cfg(test)]
+mod server;
 pub mod sqlite;
 #[cfg(test)]
 pub(crate) mod tests;
@@ -42,6 +46,19 @@ pub enum StoreError {
         /// What it said.
         #[from]
         source: rusqlite::Error,
+    },
+    /// PostgreSQL failed; nothing was kept.
+    #[error("alarm store: {}", in_words(source))]
+    Postgres {
+        /// What it said.
+        #[from]
+        source: ::postgres::Error,
+    },
+    /// What it confirms would not survive a power cut.
+    #[error("alarm store: {what}: what it confirms would not survive a power cut")]
+    Unsynced {
+        /// Which setting.
+        what: &'static str,
     },
     /// The batch that this was part of was not kept.
     #[error("alarm store: not kept: {reason}")]
@@ -86,6 +103,12 @@ pub enum StoreError {
     Stopped,
 }
 
+fn in_words(error: &::postgres::Error) -> String {
+    error
+        .as_db_error()
+        .map_or_else(|| error.to_string(), |said| said.message().to_owned())
+}
+
 /// How much of an alarm a link carries.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Completeness {
@@ -93,6 +116,12 @@ pub enum Completeness {
     Full,
     /// Part of it; the rest was filled in by the receiver.
     Summary,
+}
+
+impl Completeness {
+    fn of(summary: bool) -> Self {
+        if summary { Self::Summary } else { Self::Full }
+    }
 }
 
 /// One alarm as it came.
@@ -225,6 +254,17 @@ pub struct ToldAction {
     pub by: String,
 }
 
+/// An alarm for the bus.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct BusRow {
+    pub row: i64,
+    pub id: String,
+    pub revision: u32,
+    pub completeness: Completeness,
+    pub uav: String,
+    pub feature: String,
+}
+
 /// Up to where this station has told the bus.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub(super) struct BusCursor {
@@ -326,8 +366,9 @@ pub(super) trait Store: Send + Sync + std::fmt::Debug {
     fn newest_action(&self) -> Result<i64, StoreError>;
     /// Counts what there is.
     fn census(&self) -> Result<Census, StoreError>;
+    /// Alarms after a row that did not come from the bus, oldest first.
+    fn bus_after(&self, after: i64, limit: u32) -> Result<Vec<BusRow>, StoreError>;
     /// Where the bus is.
-    #[expect(dead_code, reason = "the bus comes next")]
     fn bus_cursor(&self) -> Result<BusCursor, StoreError>;
 }
 

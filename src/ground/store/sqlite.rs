@@ -1,9 +1,10 @@
 //! The store that is built in: SQLite in WAL mode, synced at each commit.
 
-use super::super::{action::Action, action::Kind, database_in, lock};
+use super::super::{action::Action, action::Kind, bus, database_in, lock};
 use super::{
-    Batch, BusCursor, Census, HistoryRow, Latest, Loaded, NewAction, NewAlarm, Rank, Row,
-    SCHEMA_VERSION, Search, Standing, Store, StoreError, ToldAction, list, on_one_line, unlist,
+    Batch, BusCursor, BusRow, Census, Completeness, HistoryRow, Latest, Loaded, NewAction,
+    NewAlarm, Rank, Row, SCHEMA_VERSION, Search, Standing, Store, StoreError, ToldAction, list,
+    on_one_line, unlist,
 };
 use emberfix_frames::ServiceTime;
 use rusqlite::{Connection, OpenFlags, Transaction, TransactionBehavior, params};
@@ -332,6 +333,21 @@ impl Store for Sqlite {
             })
         };
         Ok(lock(&self.reader).query_row(query, [], count)?)
+    }
+
+    fn bus_after(&self, after: i64, limit: u32) -> Result<Vec<BusRow>, StoreError> {
+        let query = "SELECT row, id, revision, summary, uav, feature FROM alarms
+                     WHERE row > ?1 AND link <> ?2 ORDER BY row LIMIT ?3";
+        self.rows(query, params![after, bus::LINK_NAME, limit], |row| {
+            Ok(BusRow {
+                row: row.get(0)?,
+                id: row.get(1)?,
+                revision: row.get(2)?,
+                completeness: Completeness::of(row.get(3)?),
+                uav: row.get(4)?,
+                feature: row.get(5)?,
+            })
+        })
     }
 
     fn bus_cursor(&self) -> Result<BusCursor, StoreError> {

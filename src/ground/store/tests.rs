@@ -1,5 +1,7 @@
 //! What every store promises, held against each of them; and the old layout brought up to date.
 
+use super::postgres::Postgres;
+use super::server::Server;
 use super::sqlite::Sqlite;
 use super::*;
 use crate::ground::action::Kind;
@@ -7,6 +9,7 @@ use crate::ground::incident::OperatorState;
 use crate::ground::writer::{Order, OrderError, Published, Writer};
 use crate::ground::{Incident, News, database_in};
 use std::sync::Arc;
+use std::task::{Context, Wake, Waker};
 
 pub fn feature(id: &str, revision: u32, captured_at: &str) -> String {
     format!(
@@ -125,22 +128,56 @@ fn from(uav: &str, fire: u32, revision: u32, east_m: f64) -> Delivery {
     delivery_of(raw, Completeness::Full)
 }
 
-/// A folder for the test's life and a way to open the same store in it again and again.
+/// A place for the test's life and a way to open the same store in it again and again.
 pub(in crate::ground) struct Place {
-    folder: tempfile::TempDir,
-    open: fn(&std::path::Path) -> Arc<dyn Store>,
+    open: Box<dyn Fn() -> Arc<dyn Store>>,
 }
 
 impl Place {
     pub fn kit(&self) -> Kit {
-        Kit::open((self.open)(self.folder.path()))
+        Kit::open((self.open)())
     }
 }
 
 fn sqlite() -> Place {
+    let folder = tempfile::tempdir().unwrap();
     Place {
-        folder: tempfile::tempdir().unwrap(),
-        open: |folder| Arc::new(Sqlite::open(folder).unwrap()),
+        open: Box::new(move || Arc::new(Sqlite::open(folder.path()).unwrap())),
+    }
+}
+
+fn postgres(server: &Server, name: &str) -> Place {
+    let url = server.database(name);
+    Place {
+        open: Box::new(move || Arc::new(Postgres::open(&url).unwrap())),
+    }
+}
+
+/// Runs a future on this thread, where the PostgreSQL client may block as it does in the writer's
+/// thread; clocks and tasks belong to a runtime beside it.
+fn block_on(future: impl Future) {
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(1)
+        .enable_all()
+        .build()
+        .unwrap();
+    let _inside = runtime.enter();
+    let waker = Waker::from(Arc::new(Unpark(std::thread::current())));
+    let mut future = std::pin::pin!(future);
+    while future
+        .as_mut()
+        .poll(&mut Context::from_waker(&waker))
+        .is_pending()
+    {
+        std::thread::park();
+    }
+}
+
+struct Unpark(std::thread::Thread);
+
+impl Wake for Unpark {
+    fn wake(self: Arc<Self>) {
+        self.0.unpark();
     }
 }
 
@@ -149,6 +186,21 @@ macro_rules! contract {
     ($($name:ident)*) => {
         mod on_sqlite {
             $(#[tokio::test] async fn $name() { super::$name(super::sqlite()).await })*
+        }
+
+        #[test]
+        fn all_of_it_on_postgresql_with_postgis() {
+            let server = match Server::start() {
+                Ok(server) => server,
+                Err(reason) => {
+                    println!("skipped: {reason}");
+                    return;
+                }
+            };
+            $(
+                println!("{}", stringify!($name));
+                block_on($name(postgres(&server, stringify!($name))));
+            )*
         }
     };
 }

@@ -1,0 +1,364 @@
+//! Many stations: NATS JetStream carries every alarm from the station that received it to all others.
+//!
+//! **Out.** Every alarm that came in by another way is published to `<prefix>.alarm.<aircraft>` with
+//! `Nats-Msg-Id` = alarm id, revision and completeness, so that the stream takes it once. The station's
+//! own disk has it before, and a cursor says up to which row the bus has confirmed it.
+//! **In.** A durable consumer per station; a message is acknowledged (and the acknowledgement
+//! confirmed) only when this station's disk has the alarm. What comes twice changes nothing.
+//!
+//! **Trust.** JetStream confirms before it syncs unless it is told to (`sync_interval: always`), and
+//! has lost confirmed messages in power cuts. So the cursor remembers the sequence number that was
+//! confirmed: a stream that ends before it, or that was made anew, is told everything again from the
+//! row where it is known to be whole. De-duplication makes that harmless.
+//!
+//! **Known limits.** Operators' actions stay at the station where they were taken. Alarms only; images
+//! go with the aircraft's own link.
+
+use super::store::{BusCursor, BusRow, Completeness, StoreError};
+use super::{ReceiveError, Station};
+use async_nats::jetstream::consumer::{AckPolicy, DeliverPolicy, pull};
+use async_nats::jetstream::context::PublishAckFuture;
+use async_nats::jetstream::message::PublishMessage;
+use async_nats::jetstream::stream::{self, DiscardPolicy, StorageType};
+use async_nats::jetstream::{self, AckKind, Message};
+use serde::Serialize;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+use tokio::task::{JoinError, JoinSet};
+use tokio_stream::StreamExt;
+
+/// Source of alarms as the store names it; what came this way is not sent back.
+pub(super) const LINK_NAME: &str = "nats";
+/// Rows that are published before their confirmations are awaited.
+const PAGE: u32 = 256;
+/// How long JetStream remembers message ids; beyond, the stations' own stores keep order.
+const DUPLICATES: Duration = Duration::from_secs(600);
+/// Pause after a failure.
+const PAUSE: Duration = Duration::from_millis(500);
+/// Header that says how much of the alarm a link carried.
+const COMPLETENESS: &str = "Emberfix-Completeness";
+/// Messages that are taken at once.
+const AT_ONCE: usize = 512;
+/// After this time an unacknowledged message comes again.
+const ACK_WAIT: Duration = Duration::from_secs(10);
+
+/// Where the bus is and who we are on it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct BusConfig {
+    pub url: String,
+    /// Name of this station: its consumer's.
+    pub station: String,
+    /// Name of the stream; its subjects are `<stream in small letters>.alarm.>`.
+    pub stream: String,
+    pub replicas: usize,
+    pub credentials: Option<std::path::PathBuf>,
+}
+
+/// How the bus fares, for `/health`.
+#[derive(Debug, Default, Serialize)]
+pub(super) struct BusHealth {
+    /// Alarms that the bus has confirmed.
+    published: AtomicU64,
+    /// Of those, the ones that it had already.
+    repeated: AtomicU64,
+    /// Alarms that came from it.
+    received: AtomicU64,
+    /// Messages that were no alarm, or one that contradicts another.
+    refused: AtomicU64,
+    /// Times that the bus had lost what it had confirmed, and was told again.
+    pub(super) told_again: AtomicU64,
+    /// Failures of the connection and of the server.
+    failures: AtomicU64,
+}
+
+/// Why the bus does not go on for the moment.
+#[derive(Debug, thiserror::Error)]
+enum BusError {
+    #[error("bus {doing}: {source}")]
+    Nats {
+        doing: &'static str,
+        source: async_nats::Error,
+    },
+    #[error(transparent)]
+    Store(#[from] StoreError),
+}
+
+fn nats<E: Into<async_nats::Error>>(doing: &'static str) -> impl FnOnce(E) -> BusError {
+    move |source| BusError::Nats {
+        doing,
+        source: source.into(),
+    }
+}
+
+/// Talks to the bus until the station stops; a bus that is not there is tried again and again.
+pub(super) async fn run(station: Arc<Station>, config: BusConfig) {
+    let mut stopping = station.stopping.subscribe();
+    let both = async {
+        tokio::join!(
+            for_ever(&station, &config, Way::Out),
+            for_ever(&station, &config, Way::In)
+        )
+    };
+    tokio::select! {
+        _ = both => {}
+        _ = stopping.wait_for(|stop| *stop) => {}
+    }
+}
+
+#[derive(Debug, Clone, Copy)]
+enum Way {
+    Out,
+    In,
+}
+
+async fn for_ever(station: &Arc<Station>, config: &BusConfig, way: Way) {
+    loop {
+        let ended = match way {
+            Way::Out => publish(station, config).await,
+            Way::In => consume(station, config).await,
+        };
+        if let Err(error) = ended {
+            station.bus.failures.fetch_add(1, Ordering::Relaxed);
+            tracing::warn!(%error, ?way, "the bus pauses");
+        }
+        tokio::time::sleep(PAUSE).await;
+    }
+}
+
+async fn connect(config: &BusConfig) -> Result<jetstream::Context, BusError> {
+    let mut options = async_nats::ConnectOptions::new()
+        .name(format!("emberfix ground {}", config.station))
+        .connection_timeout(Duration::from_secs(5));
+    if let Some(path) = &config.credentials {
+        let text = tokio::fs::read_to_string(path)
+            .await
+            .map_err(nats("reads its credentials"))?;
+        options = options
+            .credentials(&text)
+            .map_err(nats("reads its credentials"))?;
+    }
+    let client = options
+        .connect(&config.url)
+        .await
+        .map_err(nats("connects"))?;
+    Ok(jetstream::new(client))
+}
+
+async fn open(
+    config: &BusConfig,
+    context: &jetstream::Context,
+) -> Result<stream::Stream, BusError> {
+    let prefix = config.stream.to_lowercase();
+    let wanted = stream::Config {
+        name: config.stream.clone(),
+        subjects: vec![format!("{prefix}.alarm.>")],
+        storage: StorageType::File,
+        // Full is refused, not made room for: nothing that is confirmed goes.
+        discard: DiscardPolicy::New,
+        duplicate_window: DUPLICATES,
+        num_replicas: config.replicas,
+        max_message_size: 64 * 1024,
+        description: Some("alarms of fire, from every station to every other".to_owned()),
+        ..stream::Config::default()
+    };
+    context
+        .get_or_create_stream(wanted)
+        .await
+        .map_err(nats("opens its stream"))
+}
+
+// --- out -----------------------------------------------------------------------------------------
+
+async fn publish(station: &Arc<Station>, config: &BusConfig) -> Result<(), BusError> {
+    let context = connect(config).await?;
+    let mut cursor = resume(station, &open(config, &context).await?).await?;
+    let mut rows = station.rows();
+    loop {
+        rows.mark_unchanged();
+        let after = cursor.row;
+        let page = station
+            .with_store(move |store| store.bus_after(after, PAGE))
+            .await?;
+        if page.is_empty() {
+            let _ = tokio::time::timeout(Duration::from_secs(5), rows.changed()).await;
+            continue;
+        }
+        confirm(station, config, &context, &page, &mut cursor).await?;
+        station.writer.bus(cursor.clone()).await?;
+    }
+}
+
+/// Where to go on: behind what was confirmed, if the stream still has that.
+async fn resume(station: &Arc<Station>, stream: &stream::Stream) -> Result<BusCursor, BusError> {
+    let info = stream
+        .get_info()
+        .await
+        .map_err(nats("asks for its stream"))?;
+    let made = info.created.unix_timestamp_nanos();
+    let name = format!("{} of {made}", info.config.name);
+    let cursor = station.with_store(|store| store.bus_cursor()).await?;
+    if cursor.stream == name && info.state.last_sequence >= cursor.sequence {
+        return Ok(cursor);
+    }
+    if cursor.row > 0 {
+        tracing::error!(
+            confirmed = cursor.sequence,
+            there = info.state.last_sequence,
+            "the bus has lost what it had confirmed; it is told everything again"
+        );
+        station.bus.told_again.fetch_add(1, Ordering::Relaxed);
+    }
+    Ok(BusCursor {
+        row: 0,
+        sequence: 0,
+        stream: name,
+    })
+}
+
+/// Publishes a page and waits until all of it is confirmed.
+async fn confirm(
+    station: &Arc<Station>,
+    config: &BusConfig,
+    context: &jetstream::Context,
+    page: &[BusRow],
+    cursor: &mut BusCursor,
+) -> Result<(), BusError> {
+    let mut waiting: Vec<(i64, PublishAckFuture)> = Vec::new();
+    for row in page {
+        let message = PublishMessage::build()
+            .message_id(format!(
+                "{}/{}/{}",
+                row.id,
+                row.revision,
+                word(row.completeness)
+            ))
+            .header(COMPLETENESS, word(row.completeness))
+            .payload(row.feature.clone().into());
+        let subject = format!("{}.alarm.{}", config.stream.to_lowercase(), token(&row.uav));
+        let sent = context
+            .send_publish(subject, message)
+            .await
+            .map_err(nats("publishes"))?;
+        waiting.push((row.row, sent));
+    }
+    for (row, sent) in waiting {
+        let ack = sent.await.map_err(nats("waits for a confirmation"))?;
+        cursor.row = row;
+        cursor.sequence = cursor.sequence.max(ack.sequence);
+        let counter = if ack.duplicate {
+            &station.bus.repeated
+        } else {
+            &station.bus.published
+        };
+        counter.fetch_add(1, Ordering::Relaxed);
+    }
+    Ok(())
+}
+
+/// A name as one token of a subject: what NATS gives a meaning to is written in hexadecimal.
+fn token(name: &str) -> String {
+    let plain = |character: char| character.is_alphanumeric() || "-_".contains(character);
+    name.chars()
+        .map(|character| {
+            if plain(character) {
+                character.to_string()
+            } else {
+                format!("={:x}", u32::from(character))
+            }
+        })
+        .collect()
+}
+
+fn word(completeness: Completeness) -> &'static str {
+    match completeness {
+        Completeness::Full => "full",
+        Completeness::Summary => "summary",
+    }
+}
+
+// --- in ------------------------------------------------------------------------------------------
+
+async fn consume(station: &Arc<Station>, config: &BusConfig) -> Result<(), BusError> {
+    let context = connect(config).await?;
+    let stream = open(config, &context).await?;
+    let wanted = pull::Config {
+        durable_name: Some(config.station.clone()),
+        ack_policy: AckPolicy::Explicit,
+        ack_wait: ACK_WAIT,
+        deliver_policy: DeliverPolicy::All,
+        max_ack_pending: 1_024,
+        ..pull::Config::default()
+    };
+    let consumer = stream
+        .get_or_create_consumer(&config.station, wanted)
+        .await
+        .map_err(nats("opens its consumer"))?;
+    let mut messages = consumer
+        .messages()
+        .await
+        .map_err(nats("asks for messages"))?;
+    // Many at once, so that the writer has a batch; their order does not matter.
+    let mut under_way: JoinSet<Result<(), BusError>> = JoinSet::new();
+    while let Some(message) = messages.next().await {
+        let (station, message) = (Arc::clone(station), message.map_err(nats("reads"))?);
+        under_way.spawn(async move { take(&station, &message).await });
+        while under_way.len() >= AT_ONCE {
+            done(under_way.join_next().await)?;
+        }
+        while let Some(ended) = under_way.try_join_next() {
+            done(Some(ended))?;
+        }
+    }
+    Ok(())
+}
+
+fn done(ended: Option<Result<Result<(), BusError>, JoinError>>) -> Result<(), BusError> {
+    match ended {
+        Some(Ok(taken)) => taken,
+        Some(Err(_)) | None => Ok(()),
+    }
+}
+
+async fn take(station: &Arc<Station>, message: &Message) -> Result<(), BusError> {
+    let said = message
+        .headers
+        .as_ref()
+        .and_then(|headers| headers.get(COMPLETENESS));
+    let completeness = match said.map(|said| said.as_str()) {
+        Some("summary") => Completeness::Summary,
+        _ => Completeness::Full,
+    };
+    match station
+        .receive(&message.payload, LINK_NAME, completeness)
+        .await
+    {
+        Ok(_) => {
+            station.bus.received.fetch_add(1, Ordering::Relaxed);
+        }
+        // The disk fails: it has to come again.
+        Err(ReceiveError::Store(error)) if !matches!(error, StoreError::Conflict { .. }) => {
+            return Err(error.into());
+        }
+        // It will not become an alarm by coming again.
+        Err(_) => {
+            station.bus.refused.fetch_add(1, Ordering::Relaxed);
+            return message
+                .ack_with(AckKind::Term)
+                .await
+                .map_err(nats("refuses"));
+        }
+    }
+    message.ack().await.map_err(nats("acknowledges"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::token;
+
+    #[test]
+    fn an_aircrafts_name_is_one_token_whatever_it_is() {
+        assert_eq!(token("uav-1_a"), "uav-1_a");
+        assert_eq!(token("a.b *>"), "a=2eb=20=2a=3e");
+    }
+}
