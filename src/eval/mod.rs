@@ -8,6 +8,7 @@
 
 pub mod boresight;
 pub mod calibration;
+pub mod ground;
 pub mod location;
 pub mod range;
 pub mod trend;

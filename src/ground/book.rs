@@ -7,7 +7,7 @@
 use super::action::{Action, Kind};
 use super::incident::{Circumstances, Incident, News, Operator, Part};
 use super::merge::fuse::Estimate;
-use super::merge::{self, JOIN, LEAVE, Pins, Sighting, distance2};
+use super::merge::{self, JOIN, LEAVE, Pins, Sighting, distance2, may_reach};
 use super::store::Rank;
 use crate::alarm::Alarm;
 use emberfix_frames::{Coordinate, Ecef, Metres, Vector3};
@@ -356,7 +356,11 @@ impl Book {
         if other.alarm.properties.uav == entry.alarm.properties.uav || apart_m > MAX_APART_M {
             return None;
         }
-        let distance2 = distance2(&sighting(entry), &sighting(other));
+        let (one, two) = (sighting(entry), sighting(other));
+        if !may_reach(&one, &two, apart_m) {
+            return None;
+        }
+        let distance2 = distance2(&one, &two);
         let limit = if other.incident == entry.incident {
             LEAVE
         } else {

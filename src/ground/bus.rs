@@ -51,6 +51,8 @@ pub(super) struct BusConfig {
     pub station: String,
     /// Name of the stream; its subjects are `<stream in small letters>.alarm.>`.
     pub stream: String,
+    /// Domain of the JetStream that has it; a leaf node reaches it by that name only.
+    pub domain: Option<String>,
     pub replicas: usize,
     pub credentials: Option<std::path::PathBuf>,
 }
@@ -142,7 +144,10 @@ async fn connect(config: &BusConfig) -> Result<jetstream::Context, BusError> {
         .connect(&config.url)
         .await
         .map_err(nats("connects"))?;
-    Ok(jetstream::new(client))
+    Ok(match &config.domain {
+        Some(domain) => jetstream::with_domain(client, domain),
+        None => jetstream::new(client),
+    })
 }
 
 async fn open(

@@ -94,7 +94,8 @@ async fn station(folder: &Path, name: &str, port: u16) -> Ground {
         ..Overrides::default()
     };
     let text = format!(
-        "data_dir = \"{name}\"\n[bus]\nurl = \"nats://127.0.0.1:{port}\"\nstation = \"{name}\"\n"
+        "data_dir = \"{name}\"\n[bus]\nurl = \"nats://127.0.0.1:{port}\"\nstation = \"{name}\"\n\
+         domain = \"hub\"\n"
     );
     let config = GroundConfig::parse(&text, &folder.join("test.toml"), overrides).unwrap();
     Ground::start(config).await.unwrap()
@@ -111,6 +112,7 @@ async fn post(address: SocketAddr, fires: std::ops::Range<u32>) {
     }
 }
 
+/// Waits until a station has so many alarms.
 async fn has(ground: &Ground, alarms: i64) {
     let begun = Instant::now();
     loop {

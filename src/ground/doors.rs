@@ -35,6 +35,7 @@ pub(super) const KNOWN: &[&str] = &[
     "bus.url",
     "bus.station",
     "bus.stream",
+    "bus.domain",
     "bus.replicas",
     "bus.credentials",
 ];
@@ -80,6 +81,7 @@ struct RawBus {
     station: String,
     #[serde(default = "default_stream")]
     stream: String,
+    domain: Option<String>,
     #[serde(default = "default_replicas")]
     replicas: i64,
     credentials: Option<PathBuf>,
@@ -384,6 +386,7 @@ impl RawBus {
             url: self.url,
             station: self.station,
             stream: self.stream,
+            domain: self.domain,
             credentials: self.credentials.map(|path| folder.join(path)),
         })
     }

@@ -66,6 +66,7 @@ pub(super) fn router(
         .with_state(station)
         .layer(DefaultBodyLimit::max(MAX_BODY))
         .layer(middleware::from_fn(in_time))
+        .layer(middleware::from_fn_with_state(Arc::clone(&counting), small))
         .layer(middleware::from_fn_with_state(keeper, access::admit))
         .layer(middleware::from_fn_with_state(host_names, only_for_us))
         .layer(middleware::map_response(guarded))
@@ -109,6 +110,17 @@ fn speaks(caller: &Caller, body: &[u8]) -> Option<Response> {
 
 pub(super) fn refusal(status: StatusCode, reason: impl std::fmt::Display) -> Response {
     (status, axum::Json(json!({ "error": reason.to_string() }))).into_response()
+}
+
+/// Refuses a body by the size that it announces, before any of it is waited for.
+async fn small(State(station): Shared, request: Request, next: Next) -> Response {
+    let announced = request.headers().get(header::CONTENT_LENGTH);
+    let announced = announced.and_then(|length| length.to_str().ok()?.parse::<u64>().ok());
+    if announced.is_some_and(|length| length > MAX_BODY as u64) {
+        station.refuse(&BodyError::Large, LINK_NAME);
+        return BodyError::Large.answer();
+    }
+    next.run(request).await
 }
 
 /// A handler that has not answered in time is dropped.

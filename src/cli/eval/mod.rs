@@ -1,6 +1,7 @@
 //! `emberfix eval NAME`: measures, prints a table or JSON, draws.
 
 mod calibration;
+mod ground;
 mod location;
 mod range;
 mod trend;
@@ -64,6 +65,8 @@ pub enum Eval {
     Trend(trend::TrendArguments),
     /// Calibration of simulated rigs with known truth.
     Calibration(calibration::CalibrationArguments),
+    /// Alarms a second that one ground process keeps, with everyone connected.
+    Ground(ground::GroundArguments),
 }
 
 /// Measures one of them.
@@ -73,5 +76,6 @@ pub fn eval(what: &Eval) -> Result<(), Failure> {
         Eval::Range(arguments) => range::range(arguments),
         Eval::Trend(arguments) => trend::trend(arguments),
         Eval::Calibration(arguments) => calibration::calibration(arguments),
+        Eval::Ground(arguments) => ground::ground(arguments),
     }
 }

@@ -116,6 +116,14 @@ pub(crate) fn distance2(one: &Sighting<'_>, other: &Sighting<'_>) -> f64 {
         .map_or(f64::INFINITY, |inverse| offset.dot(&(inverse * offset)))
 }
 
+/// Whether two places are near enough that their gate is worth a look: no axis of an error is longer
+/// than all of them together. Cheap, and never wrong in saying no.
+pub(crate) fn may_reach(one: &Sighting<'_>, other: &Sighting<'_>, apart_m: f64) -> bool {
+    let newest = one.estimate.at.max(other.estimate.at);
+    let doubt = aged(&one.estimate, newest) + aged(&other.estimate, newest) + rims(one, other);
+    apart_m * apart_m <= LEAVE * doubt.trace()
+}
+
 /// Variance of which rim of a wide fire was seen: uniform over each width, in the plane.
 fn rims(one: &Sighting<'_>, other: &Sighting<'_>) -> Matrix3<f64> {
     let variance = (one.width_m * one.width_m + other.width_m * other.width_m) / 12.0;

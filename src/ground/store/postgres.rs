@@ -22,7 +22,7 @@ const SCHEMA: &str = "
 CREATE EXTENSION IF NOT EXISTS postgis;
 CREATE SCHEMA IF NOT EXISTS emberfix;
 CREATE TABLE IF NOT EXISTS emberfix.station (
-    store_id text NOT NULL, version bigint NOT NULL, only boolean PRIMARY KEY DEFAULT true CHECK (only)
+    store_id text NOT NULL, version bigint NOT NULL, single boolean PRIMARY KEY DEFAULT true CHECK (single)
 );
 CREATE TABLE IF NOT EXISTS emberfix.alarms (
     \"row\" bigint PRIMARY KEY, id text NOT NULL, revision bigint NOT NULL, summary boolean NOT NULL,
@@ -56,7 +56,7 @@ CREATE TABLE IF NOT EXISTS emberfix.fetched (
     uav text PRIMARY KEY, number bigint NOT NULL, \"at\" text NOT NULL
 );
 CREATE TABLE IF NOT EXISTS emberfix.bus (
-    only boolean PRIMARY KEY DEFAULT true CHECK (only),
+    single boolean PRIMARY KEY DEFAULT true CHECK (single),
     \"row\" bigint NOT NULL, sequence bigint NOT NULL, stream text NOT NULL
 );
 ";
@@ -533,7 +533,7 @@ fn put_rest(to: &mut Transaction<'_>, batch: &Batch) -> Result<(), StoreError> {
         let sequence = i64::try_from(bus.sequence).unwrap_or(i64::MAX);
         to.execute(
             "INSERT INTO bus (\"row\", sequence, stream) VALUES ($1, $2, $3)
-             ON CONFLICT (only) DO UPDATE SET \"row\" = excluded.\"row\",
+             ON CONFLICT (single) DO UPDATE SET \"row\" = excluded.\"row\",
              sequence = excluded.sequence, stream = excluded.stream",
             &[&bus.row, &sequence, &bus.stream],
         )?;
