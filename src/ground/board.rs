@@ -55,11 +55,15 @@ impl Board {
     /// At most `limit` incidents that changed after a row, each as it is now, oldest change first.
     pub fn since(&self, after: i64, limit: usize) -> Vec<News> {
         let from = (after.saturating_add(1), String::new());
-        self.by_row
-            .range(from..)
-            .take(limit)
-            .filter_map(|(_, id)| self.news(id))
-            .collect()
+        let changed: Vec<_> = self.by_row.range(from..).take(limit).collect();
+        let last = changed.last().map_or(after, |(row, _)| *row);
+        // A row that changed several incidents is told whole, or its rest would be passed over.
+        let rest = self.by_row.range((last, String::new())..);
+        let rest = rest.take_while(|(row, _)| *row == last);
+        let rest =
+            rest.filter(|change| last > after && changed.last().is_some_and(|end| change > end));
+        let all = changed.iter().copied().chain(rest);
+        all.filter_map(|(_, id)| self.news(id)).collect()
     }
 
     fn news(&self, id: &str) -> Option<News> {

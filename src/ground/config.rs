@@ -1,8 +1,8 @@
 //! The ground station's configuration file: raw TOML to a checked [`GroundConfig`], every problem
 //! at once.
 
-use super::screens::config::{self as screens, RawScreens, ScreensConfig};
 use super::doors::{self, Doors, RawDoors};
+use super::screens::config::{self as screens, RawScreens, ScreensConfig};
 use emberfix_calib::{KeyProblem, toml_problem, unknown_keys};
 use emberfix_mav::{LinkUrl, LinkUrlError};
 use serde::Deserialize;

@@ -224,6 +224,10 @@ impl Stream {
             for news in &news {
                 self.tell(told(news)).await?;
             }
+            // What changes meanwhile is told in the next round: a busy ground must not run this for ever.
+            if after >= until {
+                break;
+            }
         }
         after = after.max(until);
         self.cursor = Cursor::Incidents { after };
@@ -286,7 +290,7 @@ fn told(news: &incident::News) -> Event {
     match news {
         incident::News::Changed(incident) => Event::default()
             .event("incident")
-            .data(incident.to_geojson().to_string()),
+            .data(&*incident.feature()),
         incident::News::Gone { id, into, .. } => {
             let data = serde_json::json!({ "id": id, "into": into });
             Event::default().event("gone").data(data.to_string())
