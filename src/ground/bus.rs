@@ -34,6 +34,8 @@ pub(super) const LINK_NAME: &str = "nats";
 const PAGE: u32 = 256;
 /// How long JetStream remembers message ids; beyond, the stations' own stores keep order.
 const DUPLICATES: Duration = Duration::from_secs(600);
+/// With nothing to tell for so long, the bus is asked whether it still has everything.
+const IDLE: Duration = Duration::from_secs(2);
 /// Pause after a failure.
 const PAUSE: Duration = Duration::from_millis(500);
 /// Header that says how much of the alarm a link carried.
@@ -186,7 +188,10 @@ async fn publish(station: &Arc<Station>, config: &BusConfig) -> Result<(), BusEr
             .with_store(move |store| store.bus_after(after, PAGE))
             .await?;
         if page.is_empty() {
-            let _ = tokio::time::timeout(Duration::from_secs(5), rows.changed()).await;
+            if tokio::time::timeout(IDLE, rows.changed()).await.is_err() {
+                // Nothing to tell: time to see whether the bus still has what it was told.
+                cursor = resume(station, &open(config, &context).await?).await?;
+            }
             continue;
         }
         confirm(station, config, &context, &page, &mut cursor).await?;
