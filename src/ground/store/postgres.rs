@@ -473,7 +473,7 @@ fn put_incidents(to: &mut Transaction<'_>, standing: &[&Standing]) -> Result<(),
                 first_seen, captured, feature
          FROM unnest($1::text[], $2::bigint[], $3::text[], $4::float8[], $5::float8[],
                      $6::bigint[], $7::bigint[], $8::text[])
-              AS new (id, at_row, into_id, longitude, latitude, first_seen, captured, feature)
+              AS come (id, at_row, into_id, longitude, latitude, first_seen, captured, feature)
          ON CONFLICT (id) DO UPDATE SET \"row\" = excluded.\"row\", into_id = excluded.into_id,
          place = excluded.place, first_seen_ns = excluded.first_seen_ns,
          captured_ns = excluded.captured_ns, feature = excluded.feature",
