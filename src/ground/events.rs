@@ -20,13 +20,11 @@
 
 use super::store::{Row, Store, StoreError};
 use super::{Notice, Station, now};
-use crate::ground::incident::{self, Incident};
-use crate::ground::lock;
+use crate::ground::incident;
 use axum::response::sse::Event;
-use std::collections::HashMap;
 use std::convert::Infallible;
+use std::sync::Arc;
 use std::sync::atomic::Ordering;
-use std::sync::{Arc, Mutex};
 use std::time::Duration;
 use tokio::sync::broadcast::error::RecvError;
 use tokio::sync::{broadcast, mpsc, watch};
@@ -224,8 +222,7 @@ impl Stream {
             let Some(last) = news.last() else { break };
             after = last.row();
             for news in &news {
-                let event = self.place.0.texts.event(news);
-                self.tell(event).await?;
+                self.tell(told(news)).await?;
             }
             // What changes meanwhile is told in the next round: a busy ground must not run this for ever.
             if after >= until {
@@ -289,45 +286,14 @@ fn time() -> Event {
     Event::default().event("time").data(data.to_string())
 }
 
-/// Incidents as text, written once however many screens look. Bound: [`MAX_TEXTS`].
-#[derive(Debug, Default)]
-pub(super) struct Texts {
-    by_id: Mutex<HashMap<String, Written>>,
-}
-
-/// An incident, and the text of it.
-type Written = (Arc<Incident>, Arc<str>);
-
-/// Texts kept; beyond it all are let go and written anew.
-const MAX_TEXTS: usize = 4_096;
-
-impl Texts {
-    fn event(&self, news: &incident::News) -> Event {
-        match news {
-            incident::News::Changed(incident) => Event::default()
-                .event("incident")
-                .data(&*self.text(incident)),
-            incident::News::Gone { id, into, .. } => {
-                let data = serde_json::json!({ "id": id, "into": into });
-                Event::default().event("gone").data(data.to_string())
-            }
+fn told(news: &incident::News) -> Event {
+    match news {
+        incident::News::Changed(incident) => Event::default()
+            .event("incident")
+            .data(&*incident.feature()),
+        incident::News::Gone { id, into, .. } => {
+            let data = serde_json::json!({ "id": id, "into": into });
+            Event::default().event("gone").data(data.to_string())
         }
-    }
-
-    fn text(&self, incident: &Arc<Incident>) -> Arc<str> {
-        let mut by_id = lock(&self.by_id);
-        let known = by_id.get(&incident.id);
-        if let Some((_, text)) = known.filter(|(told, _)| Arc::ptr_eq(told, incident)) {
-            return Arc::clone(text);
-        }
-        let text: Arc<str> = incident.to_geojson().to_string().into();
-        if by_id.len() >= MAX_TEXTS {
-            by_id.clear();
-        }
-        by_id.insert(
-            incident.id.clone(),
-            (Arc::clone(incident), Arc::clone(&text)),
-        );
-        text
     }
 }

@@ -343,8 +343,6 @@ pub(crate) struct Station {
     published: Arc<Published>,
     chips: Arc<Mutex<Chips>>,
     screens: Screens,
-    /// Incidents as the event streams tell them.
-    texts: events::Texts,
     tracks: Mutex<Tracks>,
     /// What is told once. Bound: [`NOTICES_QUEUED`]; loss: oldest first, per stream.
     notices: broadcast::Sender<Notice>,
@@ -391,7 +389,6 @@ impl Station {
             published,
             chips,
             screens: Screens::open(&config.screens, &config.data_dir)?,
-            texts: events::Texts::default(),
             tracks: Mutex::default(),
             notices: broadcast::Sender::new(NOTICES_QUEUED),
             stopping: watch::Sender::new(false),
