@@ -4,7 +4,7 @@
 use super::DeliveryError;
 use crate::alarm::{Alarm, AlarmClass, AlarmProperties, FireId, FireState, Method};
 use crate::deliver::keys::{PublicKey, SecretKey};
-use crate::deliver::{DatagramDelivery, Outbox, OutboxError, Owner, alarm_id};
+use crate::deliver::{DatagramDelivery, Outbox, Owner, alarm_id};
 use crate::mission::GroundLinks;
 use crate::service::courier::{IpCourier, Surroundings};
 use crate::service::{Board, service_clock};
@@ -114,15 +114,16 @@ fn put_until_told(
         next += Duration::from_millis(arguments.every_ms);
         let decided = clock();
         let alarm = fires.next(&mut lock(outbox), decided)?;
+        // Said beforehand, too: a kill may come between the outbox's disk and the saying.
+        tell("putting", &alarm, decided);
         let put = lock(outbox).put(&alarm, decided);
-        tell(&alarm, decided, &put);
+        tell(if put.is_ok() { "put" } else { "refused" }, &alarm, decided);
     }
     Ok(())
 }
 
-/// `put` or `refused`, id, revision, capture time, time of decision.
-fn tell(alarm: &Alarm, decided: ServiceTime, put: &Result<crate::deliver::Put, OutboxError>) {
-    let what = if put.is_ok() { "put" } else { "refused" };
+/// What, id, revision, capture time, time of decision.
+fn tell(what: &str, alarm: &Alarm, decided: ServiceTime) {
     let properties = &alarm.properties;
     say(&format!(
         "{what} {} {} {} {}",

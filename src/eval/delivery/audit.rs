@@ -24,7 +24,9 @@ pub(super) fn compare(
         .filter(|(key, at)| kept.get(*key) != Some(at))
         .count();
     let newest = newest_revisions(&kept);
-    for put in newest_puts(puts).values() {
+    let stored: Vec<Put> = puts.iter().filter(|put| put.stored).cloned().collect();
+    let owed = newest_puts(&stored);
+    for put in owed.values() {
         let there = newest
             .get(&put.id)
             .is_some_and(|revision| *revision >= put.revision);
@@ -42,7 +44,7 @@ pub(super) fn compare(
     let twice: usize = kept.values().map(|at| at.len() - 1).sum();
     let never_put = kept.keys().filter(|key| !known(key)).count();
     Ok(Audit {
-        put: newest_puts(puts).len().max(sent.len()),
+        put: owed.len().max(sent.len()),
         lost,
         duplicated: twice + never_put,
     })
@@ -153,6 +155,7 @@ mod tests {
 
     fn put(id: &str, revision: u32) -> Put {
         Put {
+            stored: true,
             id: id.to_owned(),
             revision,
             captured_ns: 1_000_000_000 * i64::from(revision),

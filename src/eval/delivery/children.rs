@@ -16,6 +16,8 @@ const READY: Duration = Duration::from_secs(60);
 /// One alarm that an aircraft put.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Put {
+    /// The outbox said that it has it; else it may or may not.
+    pub stored: bool,
     pub id: String,
     pub revision: u32,
     pub captured_ns: i64,
@@ -23,10 +25,16 @@ pub(super) struct Put {
 }
 
 impl Put {
-    /// Reads `put ID REVISION CAPTURED DECIDED`.
+    /// Reads `putting` or `put`, ID, REVISION, CAPTURED, DECIDED.
     fn read(line: &str) -> Option<Self> {
-        let mut words = line.strip_prefix("put ")?.split(' ');
+        let (what, rest) = line.split_once(' ')?;
+        let mut words = rest.split(' ');
         Some(Self {
+            stored: match what {
+                "put" => true,
+                "putting" => false,
+                _ => return None,
+            },
             id: words.next()?.to_owned(),
             revision: words.next()?.parse().ok()?,
             captured_ns: words.next()?.parse().ok()?,
@@ -258,8 +266,13 @@ impl Aircraft {
         Ok(false)
     }
 
-    /// What it said that it put, in all its lives, in order.
+    /// What it said that the outbox has, in all its lives, in order.
     pub fn puts(&self) -> Vec<Put> {
+        self.said().into_iter().filter(|put| put.stored).collect()
+    }
+
+    /// Likewise, and what it was about to put.
+    pub fn said(&self) -> Vec<Put> {
         let of = |heard: &Heard| -> Vec<Put> {
             heard
                 .lines()

@@ -169,7 +169,7 @@ fn run(case: &Case, seed: u64, folder: &Path) -> Result<Measured, DeliveryError>
         .collect();
     ms.sort_by(f64::total_cmp);
     let database = Aircraft::database(&home);
-    let audit = compare(&database, &ground.database(), UAV, &puts)?;
+    let audit = compare(&database, &ground.database(), UAV, &aircraft.said())?;
     Ok(Measured { ms, audit })
 }
 

@@ -43,7 +43,7 @@ pub(super) fn measure(options: &Options, folder: &Path) -> Result<Found, Deliver
     let drained = drain(&mut watch, before.0, &owed);
     aircraft.land(DRAIN)?;
     let outbox = Aircraft::database(&home);
-    let audit = compare(&outbox, &ground.database(), UAV, &aircraft.puts())?;
+    let audit = compare(&outbox, &ground.database(), UAV, &aircraft.said())?;
     let mut found = Found {
         audit,
         ..Found::default()

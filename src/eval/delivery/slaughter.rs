@@ -113,7 +113,7 @@ fn run(seed: u64, folder: &Path, another: &dyn Fn() -> bool) -> Result<Killed, D
     proxy.set(Weather::good());
     killed.landed = aircraft.land(DRAIN)?;
     let outbox = Aircraft::database(&home);
-    killed.audit = compare(&outbox, &ground.database(), UAV, &aircraft.puts())?;
+    killed.audit = compare(&outbox, &ground.database(), UAV, &aircraft.said())?;
     Ok(killed)
 }
 
