@@ -137,12 +137,22 @@ impl Ground {
     }
 }
 
+/// The line that names the address, or all that was said without one. What it says later is read and
+/// dropped: a full or closed pipe would stop it.
 fn first_line(child: &mut Child) -> String {
-    let mut line = String::new();
-    if let Some(stderr) = child.stderr.take() {
-        let _ = BufReader::new(stderr).read_line(&mut line);
+    let Some(stderr) = child.stderr.take() else {
+        return String::new();
+    };
+    let mut lines = BufReader::new(stderr).lines().map_while(Result::ok);
+    let mut said = String::new();
+    for line in lines.by_ref() {
+        if line.contains("keeps alarms in") {
+            std::thread::spawn(move || lines.for_each(drop));
+            return line;
+        }
+        said += &line;
     }
-    line
+    said
 }
 
 impl Drop for Ground {

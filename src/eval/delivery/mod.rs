@@ -48,6 +48,7 @@ impl Options {
             Part::Kills if self.quick => slaughter::KILLS.1,
             Part::Kills => slaughter::KILLS.0,
             Part::Disk => 3,
+            Part::Load => 1,
         };
         self.parts.iter().map(steps).sum::<usize>() as u64
     }
@@ -62,11 +63,13 @@ pub enum Part {
     Kills,
     /// A full disk, torn writes, flipped bits.
     Disk,
+    /// Alarms a second that one ground process keeps.
+    Load,
 }
 
 impl Part {
     /// All of them.
-    pub const ALL: [Self; 3] = [Self::Latency, Self::Kills, Self::Disk];
+    pub const ALL: [Self; 4] = [Self::Latency, Self::Kills, Self::Disk, Self::Load];
 }
 
 /// Why nothing could be measured.
@@ -98,6 +101,9 @@ pub enum DeliveryError {
         /// What SQLite said.
         source: rusqlite::Error,
     },
+    /// The load on the ground could not be made.
+    #[error(transparent)]
+    Load(#[from] crate::eval::ground::LoadError),
     /// The outbox failed where it should not.
     #[error(transparent)]
     Outbox(#[from] crate::deliver::OutboxError),
@@ -164,6 +170,7 @@ pub fn measure(options: &Options, told: Told<'_>) -> Result<Report, DeliveryErro
             Part::Latency => latency::measure(options, scratch.path(), told)?,
             Part::Kills => slaughter::measure(options, scratch.path(), told)?,
             Part::Disk => disk::measure(options, scratch.path(), told)?,
+            Part::Load => load(options, told)?,
         };
         found.audit = found.audit.plus(more.audit);
         found.figures.extend(more.figures);
@@ -171,6 +178,20 @@ pub fn measure(options: &Options, told: Told<'_>) -> Result<Report, DeliveryErro
         found.details.extend(more.details);
     }
     Ok(report(options, found))
+}
+
+/// [`crate::eval::ground`] as a part of this.
+fn load(options: &Options, told: Told<'_>) -> Result<Found, DeliveryError> {
+    told("load");
+    let report = crate::eval::ground::measure(options.quick)?;
+    let mut details = serde_json::Map::new();
+    details.insert("ground".to_owned(), report.details);
+    Ok(Found {
+        figures: report.figures,
+        tables: report.tables,
+        details,
+        ..Found::default()
+    })
 }
 
 fn report(options: &Options, found: Found) -> Report {
