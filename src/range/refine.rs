@@ -363,8 +363,7 @@ fn pooled(parts: &[Refined]) -> Option<Refined> {
     if parts.len() < FEWEST_PARTS {
         return None;
     }
-    let middle =
-        |value: fn(&Refined) -> f64| median(parts.iter().map(|part| value(part)).collect());
+    let middle = |value: fn(&Refined) -> f64| median(parts.iter().map(value).collect());
     let noise = middle(|found| found.sigma_px)?;
     let mut line = Line {
         mean: middle(|found| found.disparity_px)?,

@@ -215,8 +215,10 @@ fn flame(left: &Colour, target: &Area, config: &RangeConfig) -> (Mask, Vec<f32>)
         ..((target.bottom - area.top) as usize).min(area.height());
     let mut gate = vec![false; shines.len()];
     for row in rows.clone() {
-        for index in row * width + inside.start..row * width + inside.end.min(width) {
-            gate[index] = config.mask.keeps(left.bgr[index]);
+        let end = inside.end.min(width);
+        let span = row * width + inside.start.min(end)..row * width + end;
+        for (kept, pixel) in gate[span.clone()].iter_mut().zip(&left.bgr[span]) {
+            *kept = config.mask.keeps(*pixel);
         }
     }
     let shining: Vec<bool> = gate
