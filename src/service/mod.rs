@@ -178,17 +178,22 @@ pub fn open_outbox(mission: &Mission) -> Result<Outbox, ServiceError> {
         source,
     })?;
     let key = SecretKey::load_or_make(&mission.key_file())?;
-    // What the ground has to know, said where whoever sets it up looks.
-    eprintln!(
-        "emberfix: this aircraft's public key, for the ground: [[uav]] name = \"{}\" public_key = \"{}\"",
-        mission.uav,
-        key.public()
-    );
     let owner = Owner {
         uav: mission.uav.clone(),
         key: Some(key),
     };
     Ok(Outbox::open(&folder.join("outbox.sqlite"), &LINKS, owner)?)
+}
+
+/// What the ground has to know, said where whoever sets it up looks, once nothing can be refused any more.
+fn tell_public_key(mission: &Mission, outbox: &Outbox) {
+    if let Some(key) = outbox.key() {
+        eprintln!(
+            "emberfix: this aircraft's public key, for the ground: [[uav]] name = \"{}\" public_key = \"{}\"",
+            mission.uav,
+            key.public()
+        );
+    }
 }
 
 /// Runs until Ctrl-C or SIGTERM.
@@ -217,6 +222,7 @@ pub async fn run(
     let recorder = record
         .map(|path| Recorder::create(path, &mission.rig, &RecordOptions::default()))
         .transpose()?;
+    tell_public_key(&mission, &outbox);
 
     let board = Arc::new(Board::default());
     let outbox: SharedOutbox = Arc::new(Mutex::new(outbox));
