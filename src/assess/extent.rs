@@ -5,7 +5,7 @@
 //! error, direction and speed of the head with errors.
 //!
 //! **How.** Width is a line through the last seconds, [`height`](super::height) takes what depth and
-//! lean add off the box's height, and [`front`](super::front) fits one burning body to the planes of
+//! lean add off the box's height, and `front` fits one burning body to the planes of
 //! all boxes: ground, direction and speed. Metres are worked out anew from the present range each
 //! time: a range that gets better does not look like growth.
 //!

@@ -16,12 +16,12 @@
 //! that came over MAVLink never replaces the whole alarm of the same revision.
 //!
 //! **Doors.** A loopback address serves everyone on the machine. Any other needs TLS and tokens or client
-//! certificates ([`access`]: aircraft post, screens read, operators act). What is refused is counted in
+//! certificates (`access`: aircraft post, screens read, operators act). What is refused is counted in
 //! `/health`.
 //!
-//! **Ways inside.** What comes goes through one queue to one [`writer`], which keeps the book
-//! ([`book`]: who is one fire with whom), commits a batch with one sync, and only then answers and
-//! shows it on the [`board`].
+//! **Ways inside.** What comes goes through one queue to one `writer`, which keeps the book
+//! (`book`: who is one fire with whom), commits a batch with one sync, and only then answers and
+//! shows it on the `board`.
 //!
 //! **Known limits.** Aircraft tracks live in memory ([`tracks::MAX_POINTS`] points each) and start anew with the process.
 

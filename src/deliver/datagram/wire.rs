@@ -6,7 +6,7 @@
 //!
 //! | kind | to | payload |
 //! |---|---|---|
-//! | 1 letter | ground | attempt (4); the envelope, zstd with [`DICTIONARY`] |
+//! | 1 letter | ground | attempt (4); the envelope, zstd with `DICTIONARY` |
 //! | 2 receipt | aircraft | origin; sequence (8); attempt (4); verdict (1); newest action (8); reason |
 //! | 3 beat | ground | origin; newest sequence (8); waiting (4); newest action known (8); stamp (8); position as JSON, or nothing |
 //! | 4 answer | aircraft | origin; stamp (8); newest action (8) |

@@ -2,8 +2,8 @@
 //!
 //! **In:** options and a seed. **Out:** what was lost, what came twice, how long it took. The real
 //! outbox and courier run in one child process ([`aircraft`]), the real `emberfix ground` in another; a
-//! proxy between them ([`proxy`]) loses, delays, reorders, repeats and cuts. Nothing here asks the two
-//! sides how they think they fare: the audit ([`audit`]) reads both databases.
+//! proxy between them (`proxy`) loses, delays, reorders, repeats and cuts. Nothing here asks the two
+//! sides how they think they fare: the audit (`audit`) reads both databases.
 //!
 //! **Latency** is from the decision (before the alarm is put into the outbox) to the moment at which
 //! another process can read the alarm from the ground's database: committed, synced, and up to two

@@ -1,8 +1,8 @@
 //! What the ground knows, on disk: every alarm revision as it came, every incident as it stands,
-//! every operator's action. One trait, [`Store`]; [`sqlite`] is built in, [`postgres`] takes its place
+//! every operator's action. One trait, `Store`; [`sqlite`] is built in, [`postgres`] takes its place
 //! by one line of the configuration. Both pass the same tests.
 //!
-//! When [`Store::commit`] returns, its batch survives a power cut (as far as disk and server keep
+//! When `Store::commit` returns, its batch survives a power cut (as far as disk and server keep
 //! their promises), or nothing of it was kept.
 
 pub mod postgres;
