@@ -121,14 +121,17 @@ impl Drop for Proxy {
     }
 }
 
+/// Ports that the system gives to nobody unasked (Linux hands out 32768 and up): a ground that is killed
+/// finds its port free again.
+const PORTS: std::ops::Range<u16> = 20_000..32_000;
+
 /// TCP and UDP on one free port.
 pub(super) fn one_port() -> Result<(TcpListener, UdpSocket), DeliveryError> {
     let mut last = None;
     for _ in 0..32 {
-        let tcp = TcpListener::bind("127.0.0.1:0").map_err(io("find a free port"))?;
-        let address = tcp.local_addr().map_err(io("find a free port"))?;
-        match UdpSocket::bind(address) {
-            Ok(udp) => return Ok((tcp, udp)),
+        let address = SocketAddr::from(([127, 0, 0, 1], rand::rng().random_range(PORTS)));
+        match TcpListener::bind(address).and_then(|tcp| Ok((tcp, UdpSocket::bind(address)?))) {
+            Ok(both) => return Ok(both),
             Err(error) => last = Some(error),
         }
     }
