@@ -3,19 +3,19 @@
 use emberfix_frames::ServiceTime;
 use serde::{Deserialize, Serialize};
 
-/// What was done.
+/// What was done, on the ground and as the aircraft hears of it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ActionKind {
-    /// Seen.
+    /// Seen: somebody is on it.
     Acknowledge,
     /// It is a fire.
     Confirm,
     /// It is none.
     Dismiss,
-    /// It belongs to another incident.
+    /// It is the same fire as another incident.
     Merge,
-    /// It belongs to no other incident.
+    /// One of the incident's alarms is another fire.
     Split,
     /// An earlier deed is taken back.
     Undo,
@@ -61,6 +61,25 @@ impl ActionKind {
         Self::Undo,
     ];
 
+    /// As it is written.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Acknowledge => "acknowledge",
+            Self::Confirm => "confirm",
+            Self::Dismiss => "dismiss",
+            Self::Merge => "merge",
+            Self::Split => "split",
+            Self::Undo => "undo",
+        }
+    }
+
+    /// What is written so.
+    #[must_use]
+    pub fn named(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|kind| kind.name() == name)
+    }
+
     /// What attention the alarm asks for after it; merging and splitting change nothing on board.
     #[must_use]
     pub fn attention(self) -> Option<Attention> {
@@ -70,5 +89,19 @@ impl ActionKind {
             Self::Undo => Some(Attention::Wanted),
             Self::Merge | Self::Split => None,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_kind_is_written_the_same_way_everywhere() {
+        for kind in ActionKind::ALL {
+            assert_eq!(serde_json::json!(kind), kind.name());
+            assert_eq!(ActionKind::named(kind.name()), Some(kind));
+        }
+        assert_eq!(ActionKind::named("Undo"), None);
     }
 }

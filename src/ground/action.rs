@@ -2,49 +2,10 @@
 
 use super::incident::{Operator, OperatorState};
 use emberfix_frames::ServiceTime;
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 
 /// What can be done.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Kind {
-    /// Somebody is on it.
-    Acknowledge,
-    /// It burns.
-    Confirm,
-    /// It is no fire.
-    Dismiss,
-    /// It is the same fire as another incident.
-    Merge,
-    /// One of its alarms is another fire.
-    Split,
-    /// An earlier action is taken back.
-    Undo,
-}
-
-impl Kind {
-    /// As it is written.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Acknowledge => "acknowledge",
-            Self::Confirm => "confirm",
-            Self::Dismiss => "dismiss",
-            Self::Merge => "merge",
-            Self::Split => "split",
-            Self::Undo => "undo",
-        }
-    }
-
-    /// What is written so.
-    #[must_use]
-    pub fn named(name: &str) -> Option<Self> {
-        use Kind::{Acknowledge, Confirm, Dismiss, Merge, Split, Undo};
-        [Acknowledge, Confirm, Dismiss, Merge, Split, Undo]
-            .into_iter()
-            .find(|kind| kind.name() == name)
-    }
-}
+pub use crate::alarm::ActionKind as Kind;
 
 /// One action on record.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
