@@ -169,7 +169,7 @@ impl Results {
                     self.revisions += 1;
                     self.alarms.insert(alarm.properties.id.clone(), *alarm);
                 }
-                Output::Pose(_) | Output::Detections { .. } => {}
+                Output::Pose(_) | Output::Detections { .. } | Output::Chip(_) => {}
             }
         }
         Ok(())

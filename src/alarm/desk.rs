@@ -121,6 +121,13 @@ impl AlarmDesk {
         due
     }
 
+    /// Newest revision and state that were told of a fire that people want to hear of.
+    #[must_use]
+    pub fn told(&self, fire: FireId) -> Option<(u32, FireState)> {
+        let told = self.told.get(&fire)?;
+        (!self.dismissed.contains(&fire)).then_some((told.revision, told.state))
+    }
+
     /// The id that a fire has in alarms.
     #[must_use]
     pub fn id(&self, fire: FireId) -> String {

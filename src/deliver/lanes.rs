@@ -42,6 +42,12 @@ impl HttpLanes {
         self.courier.reached(now);
     }
 
+    /// The ground answered when it was last spoken to, or nobody has tried yet.
+    #[must_use]
+    pub fn is_reached(&self) -> bool {
+        self.courier.is_open()
+    }
+
     /// Greatest number of an operator's action that the ground spoke of.
     #[must_use]
     pub fn newest_action(&self) -> u64 {

@@ -206,6 +206,12 @@ impl Courier {
         self.opens_at = None;
     }
 
+    /// Nothing says that the other side can't be reached.
+    #[must_use]
+    pub fn is_open(&self) -> bool {
+        self.opens_at.is_none()
+    }
+
     fn poison(&mut self, sent: &Receipt, now: ServiceTime) {
         let times = self.poisoned.get(&sent.id).map_or(0, |known| known.times) + 1;
         self.poisoned.insert(

@@ -9,12 +9,14 @@
 //! **Bound.** One pair waits for the telemetry that follows its shutter, for at most 250 ms; one that
 //! comes meanwhile is not looked at, and counted.
 
+mod chips;
 mod counters;
 mod feature;
 mod light;
 mod selfcheck;
 mod vision;
 
+pub use chips::{Chip, MAX_BYTES as MAX_CHIP_BYTES};
 pub use counters::Counters;
 pub use selfcheck::{Fault, SelfCheck};
 pub use vision::{Seen, Vision};
@@ -70,6 +72,8 @@ pub enum Output {
     },
     /// An alarm to be told.
     Alarm(Box<Alarm>),
+    /// A told fire's picture; comes after the alarms.
+    Chip(Box<Chip>),
 }
 
 /// Whether the pipeline does its work, and why not.
@@ -103,6 +107,7 @@ pub struct Pipeline {
     assessor: Assessor,
     wind: Option<Stamped<Wind>>,
     desk: AlarmDesk,
+    gallery: chips::Gallery,
     autopilot: AutopilotLock,
     waiting: Option<Box<Stamped<StereoPair>>>,
     last_pair_at: Option<ServiceTime>,
@@ -151,6 +156,7 @@ impl Pipeline {
             assessor: Assessor::default(),
             wind: None,
             desk: AlarmDesk::new(mission.uav.clone()),
+            gallery: chips::Gallery::default(),
             autopilot: AutopilotLock { system },
             waiting: None,
             last_pair_at: None,
@@ -428,10 +434,45 @@ impl Pipeline {
         }
         outputs.push(Output::Detections {
             at: pair.at,
-            found: seen.found,
+            found: seen.found.clone(),
         });
         outputs.extend(self.alarms(&view));
+        outputs.extend(self.pictures(&seen, &outcomes, pair.at));
         outputs
+    }
+
+    /// Pictures of the told fires that this look shows, where they are worth it.
+    fn pictures(&mut self, seen: &Seen, outcomes: &[Outcome], at: ServiceTime) -> Vec<Output> {
+        let mut pictures = Vec::new();
+        for outcome in outcomes {
+            let box_px = seen.found[seen.sightings[outcome.index].0].box_px;
+            let told = outcome
+                .fire
+                .and_then(|fire| Some((fire, self.desk.told(fire)?)));
+            let Some((fire, told)) = told else {
+                continue;
+            };
+            let offer = chips::Offer {
+                fire,
+                told,
+                box_px,
+                at,
+            };
+            if !self.gallery.takes(&offer) {
+                continue;
+            }
+            match chips::cut(&seen.left_bgr, &box_px, (self.desk.id(fire), told.0), at) {
+                Ok(chip) => pictures.push(Output::Chip(Box::new(chip))),
+                Err(error) => {
+                    self.counters.add("pictures", "failed");
+                    tracing::debug!(%error, "a fire's picture was not cut out");
+                }
+            }
+        }
+        let fires = self.tracker.fires();
+        self.gallery
+            .keep(|id| fires.iter().any(|fire| fire.id == id));
+        pictures
     }
 
     /// Both eyes against each other and against the terrain, where this pair was compared.

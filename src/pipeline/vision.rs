@@ -27,6 +27,8 @@ pub struct Seen {
     pub mono: bool,
     /// Both eyes against each other; once in `COMPARE_EVERY`.
     pub eyes: Option<EyesCompared>,
+    /// The left image, raw.
+    pub left_bgr: Mat,
 }
 
 /// Decoder, detector and ranger of one rig.
@@ -109,6 +111,7 @@ impl Vision {
             found,
             sightings,
             mono: raw.right_gray.is_none(),
+            left_bgr: raw.left_bgr,
         })
     }
 

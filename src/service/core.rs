@@ -5,7 +5,7 @@ use super::{Board, SharedOutbox, lock};
 use crate::alarm::{Action, Alarm};
 use crate::ground::Ping;
 use crate::ingest::ServiceClock;
-use crate::pipeline::{Event, Output, Pipeline};
+use crate::pipeline::{Chip, Event, Output, Pipeline};
 use crate::pose::Pose;
 use crate::record::{BodyPose, Recorder, UavFix};
 use emberfix_frames::{
@@ -138,6 +138,7 @@ impl Core {
                     }
                 }
                 Output::Alarm(alarm) => self.hand_on_alarm(&alarm),
+                Output::Chip(chip) => self.hand_on_chip(&chip),
             }
         }
     }
@@ -194,6 +195,22 @@ impl Core {
         );
         if let Some(recorder) = &self.recorder {
             recorder.write_alarm(alarm.properties.captured_at, alarm);
+        }
+    }
+
+    /// Encoded and stored behind the alarms of the same look, and only where those found room.
+    fn hand_on_chip(&mut self, chip: &Chip) {
+        if !self.unstored.is_empty() {
+            return;
+        }
+        let Some(jpeg) = chip.jpeg() else {
+            tracing::debug!(id = chip.id, "a fire's picture can't be made small enough");
+            return;
+        };
+        let put = lock(&self.outbox).put_chip(&chip.id, chip.revision, &jpeg);
+        match put {
+            Ok(kept) => tracing::debug!(id = chip.id, bytes = jpeg.len(), kept, "picture"),
+            Err(error) => tracing::warn!(%error, id = chip.id, "a fire's picture was not kept"),
         }
     }
 

@@ -2,7 +2,10 @@
 //! HTTP, says where we are, and brings back what operators did.
 //!
 //! One thread owns the socket. It looks at the outbox when something in it changed, and wakes at
-//! least every [`TICK`]; HTTP exchanges run on threads of their own and report to it.
+//! least every [`TICK`]; HTTP exchanges run on threads of their own and report to it. Fires' pictures
+//! go behind everything else ([`pictures`]).
+
+mod pictures;
 
 use super::core::Input;
 use super::{Board, SharedOutbox, lock};
@@ -18,6 +21,7 @@ use crate::deliver::{
 use crate::ingest::ServiceClock;
 use crate::mission::GroundLinks;
 use emberfix_frames::{ServiceTime, SignedDuration};
+use pictures::Pictures;
 use std::net::{SocketAddr, ToSocketAddrs, UdpSocket};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -64,6 +68,7 @@ pub struct IpCourier {
     pinged: Option<ServiceTime>,
     asking: Arc<AtomicBool>,
     complained: bool,
+    pictures: Pictures,
 }
 
 impl IpCourier {
@@ -77,7 +82,7 @@ impl IpCourier {
         let Some(url) = &ground.url else {
             return Ok(None);
         };
-        let link = HttpLink::new(url)?.trusting(ground.public_key);
+        let link = HttpLink::with(url, &ground.credentials)?.trusting(ground.public_key);
         let settings = DatagramSettings {
             origin: origin.clone(),
             key: key.clone(),
@@ -99,6 +104,7 @@ impl IpCourier {
             pinged: None,
             asking: Arc::default(),
             complained: false,
+            pictures: Pictures::default(),
         }))
     }
 
@@ -125,6 +131,7 @@ impl IpCourier {
         self.settle(around, &settled);
         self.tell_position(around, now);
         self.ask_over_http(around, now);
+        self.picture_over_http(around, now);
         self.send_datagrams((around.clock)());
     }
 
@@ -135,7 +142,7 @@ impl IpCourier {
             return;
         }
         self.looked_up = Some(now);
-        self.socket = connect(&self.place)
+        self.socket = connect(&self.place, TICK)
             .inspect_err(|error| tracing::debug!(%error, place = self.place, "no datagram socket"))
             .ok();
     }
@@ -155,8 +162,11 @@ impl IpCourier {
             };
             news.extend(link.take(&buffer[..length], (around.clock)()));
         }
-        for News::Actions(json) in news {
-            self.take_actions(around, &json);
+        for news in news {
+            match news {
+                News::Actions(json) => self.take_actions(around, &json),
+                News::Chip { id, revision } => self.picture_arrived(around, &id, revision),
+            }
         }
     }
 
@@ -172,7 +182,12 @@ impl IpCourier {
         let counts = outbox
             .waiting(DatagramDelivery::NAME)
             .and_then(|waiting| Ok((outbox.newest_sequence()?, waiting, outbox.newest_action()?)));
+        let pictures = outbox.chips_after(self.pictures.seen());
         drop(outbox);
+        match pictures {
+            Ok(pictures) => self.offer_pictures(pictures),
+            Err(error) => tracing::warn!(%error, "pictures not readable"),
+        }
         match (pending, counts) {
             (Ok(pending), Ok((sequence, waiting, action))) => {
                 self.waiting = pending;
@@ -272,6 +287,10 @@ impl IpCourier {
         });
     }
 
+    fn is_asking(&self) -> bool {
+        self.asking.load(Ordering::Acquire)
+    }
+
     /// One thing at a time beside the alarms; what comes meanwhile is left out.
     fn apart(&self, work: impl FnOnce(&HttpLink) + Send + 'static) {
         if self.asking.swap(true, Ordering::AcqRel) {
@@ -356,7 +375,8 @@ fn keep_actions(outbox: &SharedOutbox, events: Option<&SyncSender<Input>>, json:
     }
 }
 
-fn connect(place: &str) -> std::io::Result<UdpSocket> {
+/// A socket for datagrams to one host and port, read with this patience.
+pub(crate) fn connect(place: &str, patience: Duration) -> std::io::Result<UdpSocket> {
     let unknown = || std::io::Error::new(std::io::ErrorKind::NotFound, "host has no address");
     let target: SocketAddr = place.to_socket_addrs()?.next().ok_or_else(unknown)?;
     let local = if target.is_ipv4() {
@@ -366,7 +386,7 @@ fn connect(place: &str) -> std::io::Result<UdpSocket> {
     };
     let socket = UdpSocket::bind(local)?;
     socket.connect(target)?;
-    socket.set_read_timeout(Some(TICK))?;
+    socket.set_read_timeout(Some(patience))?;
     Ok(socket)
 }
 

@@ -70,7 +70,7 @@ pub enum ServiceError {
     #[error(transparent)]
     Record(#[from] RecordError),
     /// The ground's address is none.
-    #[error("ground.url: {0}")]
+    #[error("{}", .0.in_one_line())]
     GroundUrl(crate::deliver::http::HttpError),
     /// A folder can't be made.
     #[error("can't make folder {path}: {source}", path = path.display())]

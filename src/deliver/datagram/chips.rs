@@ -1,4 +1,8 @@
 //! Pictures of fires, in parts, at the speed of what is left over.
+//!
+//! **Bounds:** [`DatagramDelivery::CHIPS`] pictures wait, [`BYTES_PER_S`] are sent. **Loss rule:** a newer
+//! picture of a fire replaces one that is not on its way, beyond the bound the oldest goes, and one of
+//! which the ground takes no part for [`GIVE_UP_AFTER`] sendings is given up: the ground has a reason.
 
 use super::DatagramDelivery;
 use super::wire::ChipPart;
@@ -14,11 +18,15 @@ const BYTES_PER_S: f64 = 500.0;
 const ANSWER_IN: SignedDuration = SignedDuration::from_secs(2);
 /// Largest picture.
 const LARGEST: usize = 32 * 1024;
+/// Sendings without one byte more on the other side, while the link is up.
+const GIVE_UP_AFTER: u32 = 30;
 
 /// What waits, oldest first; the first is on its way.
 #[derive(Debug, Default)]
-pub(super) struct Chips {
+pub(crate) struct Chips {
     waiting: VecDeque<Chip>,
+    /// Sendings of the first since it last got on.
+    in_vain: u32,
     /// Not before this: the rate.
     open_at: Option<ServiceTime>,
     /// Not before this: the answer.
@@ -76,20 +84,48 @@ impl Chips {
     pub fn spend(&mut self, bytes: usize, now: ServiceTime) {
         self.open_at = Some(now + emberfix_frames::seconds(bytes as f64 / BYTES_PER_S));
         self.again_at = Some(now + ANSWER_IN);
+        self.in_vain += 1;
+        if self.in_vain > GIVE_UP_AFTER {
+            self.in_vain = 0;
+            let given_up = self.waiting.pop_front().map(|chip| chip.id);
+            tracing::debug!(?given_up, "a picture that the ground does not take");
+        }
     }
 
-    /// The ground has so much from the start; less than before when it has started anew.
-    pub fn held(&mut self, id: &str, revision: u32, held: u32) {
+    /// Nobody is there: what was sent in vain says nothing of the picture.
+    pub fn unreached(&mut self) {
+        self.in_vain = 0;
+    }
+
+    /// The ground has so much from the start; less than before when it has started anew. True when
+    /// that is all.
+    pub fn held(&mut self, id: &str, revision: u32, held: u32) -> bool {
         let Some(chip) = self.waiting.front_mut() else {
-            return;
+            return false;
         };
         if chip.id != id || chip.revision != revision {
-            return;
+            return false;
         }
         self.again_at = None;
-        chip.held = (held as usize).min(chip.jpeg.len());
-        if chip.held == chip.jpeg.len() {
+        let held = (held as usize).min(chip.jpeg.len());
+        if held > chip.held {
+            self.in_vain = 0;
+        }
+        chip.held = held;
+        let whole = chip.held == chip.jpeg.len();
+        if whole {
             self.waiting.pop_front();
+        }
+        whole
+    }
+
+    /// It got there another way.
+    pub fn forget(&mut self, id: &str, revision: u32) {
+        let first = self.waiting.front().map(|chip| chip.id.clone());
+        self.waiting
+            .retain(|chip| chip.id != id || chip.revision > revision);
+        if self.waiting.front().map(|chip| &chip.id) != first.as_ref() {
+            (self.in_vain, self.again_at) = (0, None);
         }
     }
 }

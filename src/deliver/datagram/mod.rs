@@ -20,7 +20,7 @@
 //! **Bounds.** Letters: what [`DatagramDelivery::work`] is given, at most [`DatagramDelivery::WINDOW`]
 //! at once. Pictures: [`DatagramDelivery::CHIPS`], the newest; the oldest gives way.
 
-mod chips;
+pub(crate) mod chips;
 mod pace;
 pub mod wire;
 
@@ -89,6 +89,13 @@ pub struct DatagramCounters {
 pub enum News {
     /// Operators' actions, a JSON list.
     Actions(Vec<u8>),
+    /// The ground has a fire's picture.
+    Chip {
+        /// Alarm id.
+        id: String,
+        /// Revision with which it was offered.
+        revision: u32,
+    },
 }
 
 /// Tells alarms over datagrams: what to send when, and what an answer means.
@@ -199,6 +206,11 @@ impl DatagramDelivery {
         self.chips.offer(id, revision, jpeg);
     }
 
+    /// It got to the ground another way.
+    pub fn forget_chip(&mut self, id: &str, revision: u32) {
+        self.chips.forget(id, revision);
+    }
+
     /// What was sent and answered so far.
     #[must_use]
     pub fn counters(&self) -> DatagramCounters {
@@ -278,7 +290,11 @@ impl DatagramDelivery {
             }
             ToAircraft::ChipHeld {
                 id, revision, held, ..
-            } => self.chips.held(&id, revision, held),
+            } => {
+                if self.chips.held(&id, revision, held) {
+                    return Some(News::Chip { id, revision });
+                }
+            }
         }
         None
     }
@@ -321,6 +337,7 @@ impl DatagramDelivery {
             && now - since > SILENCE
         {
             self.link = LinkState::Down;
+            self.chips.unreached();
         }
     }
 
@@ -428,7 +445,7 @@ impl DatagramDelivery {
         Some(ToGround::Ask(ask).datagram(self.settings.key.as_ref()))
     }
 
-    /// Never while a letter waits for its answer.
+    /// Never while a letter waits for its answer, and never so much that the next one would wait.
     fn chip(&mut self, now: ServiceTime) -> Option<Vec<u8>> {
         let busy = self.letters.values().any(|flight| flight.refusals == 0);
         if busy || !self.is_up() {
@@ -436,6 +453,9 @@ impl DatagramDelivery {
         }
         let part = self.chips.next_part(&self.settings.origin, now)?;
         let datagram = ToGround::Chip(part).datagram(self.settings.key.as_ref());
+        if !self.pace.affords(datagram.len()) {
+            return None;
+        }
         self.chips.spend(datagram.len(), now);
         Some(datagram)
     }

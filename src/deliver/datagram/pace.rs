@@ -107,8 +107,23 @@ impl Pace {
         self.tokens > 0.0
     }
 
+    /// Whether so much may go and something urgent right behind it: what is not urgent makes no debts.
+    pub fn affords(&self, bytes: usize) -> bool {
+        self.tokens > bytes as f64
+    }
+
     pub fn spend(&mut self, bytes: usize, _now: ServiceTime) {
         self.tokens -= bytes as f64;
+    }
+
+    /// A way that has just shown to be as slow as ways get.
+    #[cfg(test)]
+    pub fn slowest() -> Self {
+        Self {
+            bytes_per_s: RATES.1,
+            tokens: RATES.1,
+            ..Self::default()
+        }
     }
 
     /// An answer came: is there a queue?

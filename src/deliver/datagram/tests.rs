@@ -222,6 +222,65 @@ fn a_picture_takes_500_bytes_a_second_and_no_time_of_an_alarm() {
     assert!(way.there.contains_key(&letter(2, 1).sequence()));
 }
 
+/// Twenty alarms at odd moments, with and without pictures on the same way: each is at the ground at the
+/// same moment, on a way as slow as ways get, too.
+#[test]
+fn while_pictures_flow_no_alarm_is_a_millisecond_later() {
+    let times = |pictures: bool, slow: bool| {
+        let mut way = Way::new(0.0);
+        if slow {
+            way.link.pace = Pace::slowest();
+        }
+        let mut waiting = Vec::new();
+        for fire in 1..=8 * u32::from(pictures) {
+            way.link
+                .offer_chip(format!("uav-1-{fire}"), 1, vec![7; 4_000]);
+        }
+        let mut offered = 0;
+        for ms in 0..60_000 {
+            if ms >= 3_000 + i64::from(offered) * 2_611 && offered < 20 {
+                offered += 1;
+                waiting.push(letter(offered, 1));
+            }
+            way.step(&mut waiting, ms);
+        }
+        (way.there, way.chips.len())
+    };
+    for slow in [false, true] {
+        let (without, none) = times(false, slow);
+        let (with, parts) = times(true, slow);
+        assert_eq!((none, without.len()), (0, 20));
+        assert!(parts >= 20, "{parts} parts");
+        assert_eq!(with, without, "slow: {slow}");
+    }
+}
+
+#[test]
+fn a_picture_that_the_ground_does_not_take_makes_room_and_one_that_it_takes_is_told() {
+    let mut chips = Chips::default();
+    chips.offer("uav-1-1".to_owned(), 2, vec![7; 800]);
+    chips.offer("uav-1-2".to_owned(), 1, vec![7; 300]);
+    let mut now = 0;
+    let mut next = |chips: &mut Chips| {
+        now += 3_000;
+        let part = chips.next_part(&origin(), at_ms(now));
+        chips.spend(500, at_ms(now));
+        part.map(|part| (part.id, part.from))
+    };
+    assert_eq!(next(&mut chips).unwrap(), ("uav-1-1".to_owned(), 0));
+    assert!(!chips.held("uav-1-1", 2, 400), "half");
+    for _ in 0..31 {
+        assert_eq!(next(&mut chips).unwrap(), ("uav-1-1".to_owned(), 400));
+    }
+    assert_eq!(next(&mut chips).unwrap(), ("uav-1-2".to_owned(), 0));
+    assert!(!chips.held("uav-1-1", 2, 800), "given up");
+    assert!(chips.held("uav-1-2", 1, 300));
+    assert_eq!(next(&mut chips), None);
+    chips.offer("uav-1-3".to_owned(), 1, vec![7; 300]);
+    chips.forget("uav-1-3", 1);
+    assert_eq!(next(&mut chips), None, "it got there another way");
+}
+
 #[test]
 fn what_the_ground_did_not_sign_is_not_believed() {
     let ground = SecretKey::random();

@@ -3,7 +3,7 @@
 use rusqlite::{Connection, Transaction, TransactionBehavior};
 
 /// What this program writes.
-pub(super) const NEWEST: i64 = 2;
+pub(super) const NEWEST: i64 = 3;
 
 pub(super) const FIRST: &str = "
     CREATE TABLE counters (name TEXT PRIMARY KEY, value INTEGER NOT NULL) STRICT;
@@ -43,6 +43,16 @@ const SECOND: &str = "
     UPDATE receipts SET link = 'ip' WHERE link = 'http';
 ";
 
+/// Pictures of fires.
+const THIRD: &str = "
+    CREATE TABLE chips (
+        number INTEGER PRIMARY KEY AUTOINCREMENT,
+        id TEXT NOT NULL UNIQUE,
+        revision INTEGER NOT NULL,
+        jpeg BLOB NOT NULL
+    ) STRICT;
+";
+
 /// Creates the tables in a new file, renews those of an old one; says which layout it has then.
 pub(super) fn upgrade(database: &mut Connection) -> rusqlite::Result<i64> {
     let transaction = database.transaction_with_behavior(TransactionBehavior::Exclusive)?;
@@ -52,6 +62,7 @@ pub(super) fn upgrade(database: &mut Connection) -> rusqlite::Result<i64> {
     }
     step(&transaction, found < 1, FIRST)?;
     step(&transaction, found < 2, SECOND)?;
+    step(&transaction, found < 3, THIRD)?;
     transaction.pragma_update(None, "user_version", NEWEST)?;
     transaction.commit()?;
     Ok(NEWEST)

@@ -1,16 +1,19 @@
 //! The durable outbox: an alarm is on disk before it is first sent, and stays until every link
 //! delivered it.
 
+mod chips;
 mod layout;
 mod reserve;
 #[cfg(test)]
 mod tests;
 
+pub use chips::StoredChip;
+
 use super::envelope::{Envelope, Origin, Sealed};
 use super::keys::SecretKey;
 use super::link::Letter;
 use super::{Urgency, fire_number};
-use crate::alarm::{Action, Alarm, Attention, FireId};
+use crate::alarm::{Action, ActionKind, Alarm, Attention, FireId};
 use emberfix_frames::ServiceTime;
 use reserve::Reserve;
 use rusqlite::{
@@ -268,11 +271,7 @@ impl Outbox {
                 t.execute(
                     "INSERT INTO actions (alarm, number, kind) VALUES (?1, ?2, ?3)
                      ON CONFLICT (alarm) DO UPDATE SET number = ?2, kind = ?3",
-                    params![
-                        action.alarm,
-                        number,
-                        serde_json::json!(action.kind).as_str()
-                    ],
+                    params![action.alarm, number, action.kind.name()],
                 )?;
             }
             Ok(newer == 1)
@@ -525,8 +524,7 @@ fn attention(database: &Connection) -> rusqlite::Result<BTreeMap<String, Attenti
     let mut attention = BTreeMap::new();
     for row in rows {
         let (alarm, kind) = row?;
-        let kind = serde_json::from_value::<crate::alarm::ActionKind>(kind.into()).ok();
-        if let Some(wanted) = kind.and_then(crate::alarm::ActionKind::attention) {
+        if let Some(wanted) = ActionKind::named(&kind).and_then(ActionKind::attention) {
             attention.insert(alarm, wanted);
         }
     }

@@ -1,5 +1,5 @@
 use super::*;
-use crate::alarm::{ActionKind, FireState};
+use crate::alarm::FireState;
 use crate::deliver::tests_support::alarm;
 
 const NOW: ServiceTime = ServiceTime::from_unix_ns(1_772_366_400_000_000_000);
@@ -124,8 +124,8 @@ fn an_outbox_of_a_later_program_is_refused_and_left_alone() {
     assert!(matches!(
         refused,
         OutboxError::Newer {
-            found: 3,
-            known: 2,
+            found: 4,
+            known: 3,
             ..
         }
     ));
@@ -322,4 +322,42 @@ fn nothing_changed_is_seen_without_reading() {
     assert_eq!(outbox.changes(), before);
     outbox.put(&alarm(1, 1), NOW).unwrap();
     assert!(outbox.changes() > before);
+}
+
+#[test]
+fn a_fires_newest_picture_waits_until_the_ground_has_it_over_restarts_too() {
+    let place = Place::new();
+    let mut outbox = place.open();
+    let before = outbox.changes();
+    assert!(outbox.put_chip("uav-1-1", 1, &[1; 100]).unwrap());
+    assert!(outbox.put_chip("uav-1-2", 1, &[2; 100]).unwrap());
+    assert!(outbox.put_chip("uav-1-1", 4, &[3; 100]).unwrap());
+    assert!(outbox.changes() > before, "the courier has to look");
+    drop(outbox);
+    let mut outbox = place.open();
+    let waiting = outbox.chips_after(0).unwrap();
+    let named = |chips: &[StoredChip]| -> Vec<(String, u32)> {
+        chips.iter().map(|c| (c.id.clone(), c.revision)).collect()
+    };
+    assert_eq!(
+        named(&waiting),
+        [("uav-1-2".into(), 1), ("uav-1-1".into(), 4)]
+    );
+    assert_eq!(waiting[1].jpeg, [3; 100]);
+    assert_eq!(outbox.chips_after(waiting[0].number).unwrap(), waiting[1..]);
+    // An answer that is late is about the older picture.
+    outbox.drop_chip("uav-1-1", 3).unwrap();
+    outbox.drop_chip("uav-1-2", 1).unwrap();
+    assert_eq!(
+        named(&outbox.chips_after(0).unwrap()),
+        [("uav-1-1".into(), 4)]
+    );
+    for number in 10..40 {
+        outbox
+            .put_chip(&format!("uav-1-{number}"), 1, &[0; 10])
+            .unwrap();
+    }
+    let waiting = outbox.chips_after(0).unwrap();
+    assert_eq!(waiting.len(), Outbox::MAX_CHIPS as usize);
+    assert_eq!(waiting[0].id, "uav-1-24");
 }
