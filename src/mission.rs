@@ -277,6 +277,10 @@ const KNOWN: &[&str] = &[
     "track.confirm_span_s",
     "track.forget_suspected_s",
     "ground.url",
+    "ground.ca",
+    "ground.token_file",
+    "ground.certificate",
+    "ground.key",
     "ground.datagrams",
     "ground.public_key",
     "ground.agent_system_id",
@@ -492,6 +496,13 @@ fn build(raw: RawMission, path: &Path) -> Result<Mission, MissionError> {
             path: path.to_owned(),
             problems: vec![problem],
         })?;
+    let ground = raw
+        .ground
+        .build(&beside)
+        .map_err(|problems| MissionError::Values {
+            path: path.to_owned(),
+            problems,
+        })?;
     let state_dir = raw
         .state
         .dir
@@ -528,7 +539,7 @@ fn build(raw: RawMission, path: &Path) -> Result<Mission, MissionError> {
             confirm_span_s: raw.track.confirm_span_s,
             forget_suspected_s: raw.track.forget_suspected_s,
         },
-        ground: raw.ground.build(),
+        ground,
         mavlink_signing,
         key_path: raw.state.key.as_deref().map(beside),
         name: raw.name,

@@ -3,6 +3,12 @@
 
 #![expect(clippy::unwrap_used, reason = "a test may stop at its first surprise")]
 
+#[path = "support/clients.rs"]
+#[expect(dead_code, reason = "no client is needed here")]
+mod clients;
+#[path = "support/station.rs"]
+#[expect(dead_code, reason = "the station is only asked")]
+mod station;
 #[expect(
     dead_code,
     reason = "the doctor of nothing never ends with exit code 0"
@@ -10,6 +16,8 @@
 mod support;
 
 use serde_json::Value;
+use sha2::{Digest as _, Sha256};
+use station::Station;
 use std::time::{Duration, Instant};
 use support::{PLAIN_MISSION, Said, Scratch, emberfix};
 
@@ -79,4 +87,60 @@ fn a_mission_that_is_wrong_is_refused_with_every_problem_in_the_table() {
     for word in ["FAIL", "dathum", "rigg", "->", "NOT READY"] {
         assert!(said.out.contains(word), "{word:?} is not in {}", said.out);
     }
+}
+
+#[test]
+fn a_ground_station_lets_in_who_has_its_token_and_tells_others_what_to_do() {
+    let digest: String = Sha256::digest("good")
+        .iter()
+        .map(|b| format!("{b:02x}"))
+        .collect();
+    let station = Station::start(&format!(
+        "[[access]]\nname = \"uav-1\"\nrole = \"aircraft\"\ntoken_sha256 = \"{digest}\"\n"
+    ));
+    let scratch = Scratch::new();
+    scratch.write(
+        "mission.toml",
+        format!(
+            "{PLAIN_MISSION}[ground]\nurl = \"{}\"\ntoken_file = \"token\"\n",
+            station.url
+        ),
+    );
+    let examined = |token: &str| -> Value {
+        scratch.write("token", token);
+        serde_json::from_str(&doctor(&scratch, &["--json"]).out).unwrap()
+    };
+    let good = examined("good\n");
+    for name in ["ground station", "test alarm", "datagrams"] {
+        assert_eq!(finding(&good, name)["verdict"], "pass", "{good:#}");
+    }
+    let wrong = examined("wrong\n");
+    let told = finding(&wrong, "ground station");
+    assert_eq!(told["verdict"], "fail", "{told}");
+    assert!(
+        told["value"]
+            .as_str()
+            .unwrap()
+            .contains("does not let us in (401"),
+        "{told}"
+    );
+    assert!(
+        told["remedy"]
+            .as_str()
+            .unwrap()
+            .contains("ground.token_file"),
+        "{told}"
+    );
+
+    // Where anyone could read it, the mission is refused.
+    scratch.write(
+        "mission.toml",
+        format!(
+            "{PLAIN_MISSION}[ground]\nurl = \"http://10.8.0.1:8470\"\ntoken_file = \"token\"\n"
+        ),
+    );
+    let said = doctor(&scratch, &[]);
+    assert_eq!(said.code, 2, "{}", said.err);
+    let words = said.out.split_whitespace().collect::<Vec<_>>().join(" ");
+    assert!(words.contains("ask by https://"), "{words}");
 }

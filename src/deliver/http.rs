@@ -5,8 +5,10 @@
 //! around them in a header ([`envelope::HTTP_HEADER`]). **Out:** a [`Receipt`], only when the ground says
 //! that it is stored. Blocking, bounded in time; connections are kept open between alarms. No retry
 //! here: [`super::lanes`] and the outbox own that. `POST /wire` carries one datagram each way, for what
-//! else the two sides have to say. **Known limits:** no redirects; no proxies.
+//! else the two sides have to say. `https://` with the authority that the mission names, a token or a
+//! client certificate ([`Credentials`]). **Known limits:** no redirects; no proxies.
 
+use super::credentials::Credentials;
 use super::datagram::wire::{ToAircraft, ToGround, Verdict};
 use super::keys::{PublicKey, SecretKey};
 use super::{Letter, Receipt, Settled, envelope};
@@ -17,8 +19,10 @@ use base64::engine::general_purpose::STANDARD as BASE64;
 use emberfix_frames::ServiceTime;
 use serde::Deserialize;
 use std::time::Duration;
+use tokio_rustls::rustls::{CertificateError, Error as TlsError};
 use ureq::http::{Response, StatusCode};
-use ureq::{Agent, Body};
+use ureq::typestate::WithBody;
+use ureq::{Agent, Body, RequestBuilder};
 
 /// Longest wait for a connection.
 const CONNECT: Duration = Duration::from_secs(2);
@@ -34,10 +38,42 @@ pub const RECEIPT_HEADER: &str = "emberfix-receipt";
 #[derive(Debug, thiserror::Error)]
 pub enum HttpError {
     /// The URL is none that this link can use.
-    #[error("ground URL is {url:?}, allowed is http://HOST:PORT")]
+    #[error("ground.url is {url:?}, allowed is http://HOST:PORT or https://HOST:PORT")]
     Url {
         /// What was given.
         url: String,
+    },
+    /// Over `https://` somebody has to vouch for the other side.
+    #[error("ground.url is {url:?}, and ground.ca does not name whose certificates are believed")]
+    NoAuthority {
+        /// What was given.
+        url: String,
+    },
+    /// A token in the clear is everyone's.
+    #[error(
+        "ground.url is {url:?}, where anyone on the way could read the token of ground.token_file"
+    )]
+    InTheClear {
+        /// What was given.
+        url: String,
+    },
+    /// Not the other side that the authority vouches for, or it does not believe our certificate.
+    #[error("ground {url}: {problem}")]
+    Tls {
+        /// What was asked.
+        url: String,
+        /// What does not hold.
+        problem: String,
+    },
+    /// The ground's door stays shut for us.
+    #[error("ground {url} does not let us in ({status}: {reason})")]
+    Denied {
+        /// What was asked.
+        url: String,
+        /// HTTP status.
+        status: u16,
+        /// The ground's words.
+        reason: String,
     },
     /// No answer: down, unreachable, too slow. Worth a retry.
     #[error("ground {url}: {source}")]
@@ -74,6 +110,44 @@ pub enum HttpError {
 }
 
 impl HttpError {
+    /// What to do about it.
+    #[must_use]
+    pub fn remedy(&self) -> &'static str {
+        match self {
+            Self::Url { .. } => "set ground.url to http://HOST:PORT or https://HOST:PORT",
+            Self::NoAuthority { .. } => {
+                "set ground.ca to the PEM file of the authority that signed the ground's certificate"
+            }
+            Self::InTheClear { .. } => {
+                "ask by https:// (the ground needs [tls]), and set ground.ca"
+            }
+            Self::Unreachable { .. } => {
+                "start it (emberfix ground missions/ground.toml) and look at network and VPN"
+            }
+            Self::Tls { .. } => {
+                "set ground.ca to the authority of that very station and ground.url to a name in its \
+                 certificate, set this computer's clock; else find out who answers"
+            }
+            Self::Denied { status: 429, .. } => {
+                "too many wrong tokens came from this address: correct ground.token_file, wait a minute"
+            }
+            Self::Denied { .. } => {
+                "at the ground, give [[access]] role = \"aircraft\", our name in uavs, and as \
+                 token_sha256 what printf %s TOKEN | sha256sum says of the token in ground.token_file"
+            }
+            Self::Forged { .. } => "correct ground.public_key, or find out who answers",
+            Self::Refused { .. } | Self::NoReceipt { .. } => {
+                "something else answers at this address, or it refuses us: look at its log"
+            }
+        }
+    }
+
+    /// Problem and remedy.
+    #[must_use]
+    pub fn in_one_line(&self) -> String {
+        format!("{self}; {}", self.remedy())
+    }
+
     /// True when the ground will not have this very alarm; else the link or the ground is at fault.
     #[must_use]
     pub fn is_about_the_alarm(&self) -> bool {
@@ -155,25 +229,40 @@ impl Told {
 pub struct HttpLink {
     base_url: String,
     agent: Agent,
+    credentials: Credentials,
     ground: Option<PublicKey>,
 }
 
 impl HttpLink {
-    /// A link to `base_url`, such as `http://10.8.0.1:8470`. Does not connect yet.
+    /// A link to `base_url`, such as `http://10.8.0.1:8470`, that shows nothing. Does not connect yet.
     ///
     /// # Errors
     /// [`HttpError::Url`].
     pub fn new(base_url: &str) -> Result<Self, HttpError> {
+        Self::with(base_url, &Credentials::default())
+    }
+
+    /// A link to `base_url`, such as `https://ground.example:8470`. Does not connect yet.
+    ///
+    /// # Errors
+    /// [`HttpError::Url`], [`HttpError::NoAuthority`], [`HttpError::InTheClear`].
+    pub fn with(base_url: &str, credentials: &Credentials) -> Result<Self, HttpError> {
         let refused = || HttpError::Url {
             url: base_url.to_owned(),
         };
         let trimmed = base_url.trim_end_matches('/');
         let uri: ureq::http::Uri = trimmed.parse().map_err(|_| refused())?;
         let bare = matches!(uri.path_and_query().map(|p| p.as_str()), None | Some("/"));
-        if uri.scheme_str() != Some("http") || uri.host().is_none_or(str::is_empty) || !bare {
-            return Err(refused());
+        let host = uri
+            .host()
+            .filter(|host| !host.is_empty() && bare)
+            .ok_or_else(refused)?;
+        check_scheme(uri.scheme_str(), host, base_url, credentials)?;
+        let mut config = Agent::config_builder();
+        if let Some(tls) = credentials.tls() {
+            config = config.tls_config(tls.clone());
         }
-        let config = Agent::config_builder()
+        let config = config
             .timeout_connect(Some(CONNECT))
             .timeout_global(Some(EXCHANGE))
             .max_redirects(0)
@@ -185,6 +274,7 @@ impl HttpLink {
         Ok(Self {
             base_url: trimmed.to_owned(),
             agent: config.into(),
+            credentials: credentials.clone(),
             ground: None,
         })
     }
@@ -199,14 +289,17 @@ impl HttpLink {
     /// Host and port.
     #[must_use]
     pub fn place(&self) -> String {
-        let place = self.base_url.trim_start_matches("http://");
+        let (place, port) = match self.base_url.strip_prefix("https://") {
+            Some(place) => (place, 443),
+            None => (self.base_url.trim_start_matches("http://"), 80),
+        };
         let has_port = place
             .rfind(':')
             .is_some_and(|at| !place[at..].contains(']'));
         if has_port {
             place.to_owned()
         } else {
-            format!("{place}:80")
+            format!("{place}:{port}")
         }
     }
 
@@ -226,9 +319,7 @@ impl HttpLink {
         let sealed = &letter.sealed;
         let head = sealed.envelope.http_header(sealed.signature.as_ref());
         let request = self
-            .agent
-            .post(&url)
-            .header("content-type", "application/geo+json")
+            .posting(&url, "application/geo+json")
             .header(envelope::HTTP_HEADER, head);
         let sent = request.send(&sealed.envelope.alarm[..]);
         let mut answer = sent.map_err(|source| unreachable(&url, source))?;
@@ -277,6 +368,9 @@ impl HttpLink {
                 },
                 newest_action: 0,
             },
+            Err(error @ (HttpError::Tls { .. } | HttpError::Denied { .. })) => {
+                Told::unreachable(&error.in_one_line())
+            }
             Err(error) => Told::unreachable(&error.to_string()),
         }
     }
@@ -291,7 +385,7 @@ impl HttpLink {
         key: Option<&SecretKey>,
     ) -> Result<ToAircraft, HttpError> {
         let url = format!("{}/wire", self.base_url);
-        let request = self.agent.post(&url).header("content-type", WIRE_KIND);
+        let request = self.posting(&url, WIRE_KIND);
         let sent = request.send(&said.datagram(key)[..]);
         let mut answer = sent.map_err(|source| unreachable(&url, source))?;
         let status = check_status(&url, &mut answer)?.as_u16();
@@ -357,11 +451,8 @@ impl HttpLink {
     /// [`HttpError`].
     pub fn health(&self) -> Result<StationHealth, HttpError> {
         let url = format!("{}/health", self.base_url);
-        let asked = self.agent.get(&url).call();
-        let mut answer = asked.map_err(|source| HttpError::Unreachable {
-            url: url.clone(),
-            source: Box::new(source),
-        })?;
+        let asked = self.showing(self.agent.get(&url)).call();
+        let mut answer = asked.map_err(|source| unreachable(&url, source))?;
         let status = check_status(&url, &mut answer)?;
         read_json::<RawHealth>(&mut answer)
             .filter(|health| health.status == "ok")
@@ -396,22 +487,76 @@ impl HttpLink {
     }
 
     fn post(&self, url: &str, kind: &str, json: &str) -> Result<Response<Body>, HttpError> {
-        self.agent
-            .post(url)
-            .header("content-type", kind)
-            .send(json)
-            .map_err(|source| unreachable(url, source))
+        let sent = self.posting(url, kind).send(json);
+        sent.map_err(|source| unreachable(url, source))
     }
+
+    fn posting(&self, url: &str, kind: &str) -> RequestBuilder<WithBody> {
+        self.showing(self.agent.post(url))
+            .header("content-type", kind)
+    }
+
+    /// Says who we are, if the ground is to know.
+    fn showing<Any>(&self, request: RequestBuilder<Any>) -> RequestBuilder<Any> {
+        match self.credentials.authorization() {
+            Some(token) => request.header("authorization", token),
+            None => request,
+        }
+    }
+}
+
+/// Whether what has to stay secret does, and whether somebody vouches for the other side.
+fn check_scheme(
+    scheme: Option<&str>,
+    host: &str,
+    base_url: &str,
+    credentials: &Credentials,
+) -> Result<(), HttpError> {
+    let url = base_url.to_owned();
+    match scheme {
+        Some("https") if credentials.tls().is_none() => Err(HttpError::NoAuthority { url }),
+        Some("http") if credentials.authorization().is_some() && !is_this_computer(host) => {
+            Err(HttpError::InTheClear { url })
+        }
+        Some("http" | "https") => Ok(()),
+        _ => Err(HttpError::Url { url }),
+    }
+}
+
+fn is_this_computer(host: &str) -> bool {
+    let bare = host.trim_start_matches('[').trim_end_matches(']');
+    let address = bare.parse::<std::net::IpAddr>();
+    host == "localhost" || address.is_ok_and(|address| address.is_loopback())
 }
 
 /// What `POST /wire` carries.
 pub const WIRE_KIND: &str = "application/octet-stream";
 
 fn unreachable(url: &str, source: ureq::Error) -> HttpError {
-    HttpError::Unreachable {
-        url: url.to_owned(),
-        source: Box::new(source),
+    let url = url.to_owned();
+    match tls_problem(&source) {
+        Some(problem) => HttpError::Tls { url, problem },
+        None => HttpError::Unreachable {
+            url,
+            source: Box::new(source),
+        },
     }
+}
+
+/// What TLS found wrong, if that is why nobody was reached.
+fn tls_problem(error: &ureq::Error) -> Option<String> {
+    let error = match error {
+        ureq::Error::Rustls(error) => error,
+        ureq::Error::Io(error) => error.get_ref()?.downcast_ref::<TlsError>()?,
+        _ => return None,
+    };
+    Some(match error {
+        TlsError::InvalidCertificate(
+            CertificateError::UnknownIssuer | CertificateError::BadSignature,
+        ) => "no authority in ground.ca signed its certificate".to_owned(),
+        TlsError::InvalidMessage(_) => "what answers there speaks no TLS".to_owned(),
+        other => other.to_string(),
+    })
 }
 
 fn read_json<T: serde::de::DeserializeOwned>(answer: &mut Response<Body>) -> Option<T> {
@@ -432,10 +577,18 @@ fn check_status(url: &str, answer: &mut Response<Body>) -> Result<StatusCode, Ht
         Some(refusal) => refusal.error,
         None => "no reason given".to_owned(),
     };
-    Err(HttpError::Refused {
-        url: url.to_owned(),
-        status: status.as_u16(),
-        reason,
+    let (url, status) = (url.to_owned(), status.as_u16());
+    Err(match status {
+        401 | 403 | 429 => HttpError::Denied {
+            url,
+            status,
+            reason,
+        },
+        _ => HttpError::Refused {
+            url,
+            status,
+            reason,
+        },
     })
 }
 
@@ -526,7 +679,7 @@ mod tests {
     #[test]
     fn a_url_that_this_link_cannot_use_is_refused_at_once() {
         for url in [
-            "https://10.8.0.1",
+            "ftp://10.8.0.1",
             "10.8.0.1:8470",
             "http://",
             "http://a/alarms",

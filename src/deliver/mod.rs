@@ -27,6 +27,7 @@
 //! **Ways over IP**, one link in the outbox: datagrams ([`datagram`]), and HTTP ([`lanes`]) for what fits
 //! into none, or where no datagram gets through.
 
+pub mod credentials;
 pub mod datagram;
 pub mod envelope;
 pub mod http;
@@ -42,6 +43,7 @@ pub mod spatial;
 #[cfg(test)]
 mod contract;
 
+pub use credentials::{CredentialFiles, Credentials};
 pub use datagram::{DatagramDelivery, DatagramSettings};
 pub use http::{HttpError, HttpLink};
 pub use lanes::HttpLanes;
@@ -73,3 +75,5 @@ pub fn default_uav(system: SystemId) -> String {
 
 #[cfg(test)]
 mod tests_support;
+#[cfg(test)]
+mod tls_tests;

@@ -306,6 +306,7 @@ fn ground(test: Result<Duration, HttpError>) -> Option<GroundSeen> {
             ahead: Some(SignedDuration::from_millis(20)),
         }),
         test,
+        datagrams: Some(Ok(Duration::from_millis(12))),
     })
 }
 
@@ -330,6 +331,11 @@ fn one_way_to_the_ground_is_enough_and_none_fails() {
         reason: String::new(),
     }));
     assert_eq!(verdicts(&old, &autopilot()), Verdict::Warn);
+    let by_http_alone = ok.map(|seen| GroundSeen {
+        datagrams: Some(Err("no answer".to_owned())),
+        ..seen
+    });
+    assert_eq!(verdicts(&by_http_alone, &autopilot()), Verdict::Warn);
 }
 
 #[test]

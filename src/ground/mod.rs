@@ -263,6 +263,12 @@ impl Ground {
         if config.datagrams && (address.ip().is_loopback() || signed) {
             let socket = tokio::net::UdpSocket::bind(address).await.map_err(in_use)?;
             tokio::spawn(datagram::run(Arc::clone(&station), socket));
+        } else if config.datagrams {
+            eprintln!(
+                "emberfix: no datagrams: beyond this machine they have to be signed, and no [[uav]] has a \
+                 public_key (emberfix keys MISSION prints it on the aircraft); alarms come by HTTP alone; \
+                 datagrams = false says that this is meant"
+            );
         }
         let names = Arc::from(config.host_names.as_slice());
         let app = http::router(Arc::clone(&station), names, config.doors.accesses);

@@ -1,6 +1,8 @@
 //! The mission's links: whom the aircraft talks to, and what it signs with.
 
+use crate::deliver::http::HttpLink;
 use crate::deliver::keys::PublicKey;
+use crate::deliver::{CredentialFiles, Credentials};
 use emberfix_calib::Checks;
 use emberfix_mav::SigningKey;
 use emberfix_mav::signing::USUAL_UNSIGNED;
@@ -8,10 +10,12 @@ use serde::Deserialize;
 use std::path::{Path, PathBuf};
 
 /// How alarms reach the ground.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone)]
 pub struct GroundLinks {
-    /// HTTP address of the ground station, if there is an IP path.
+    /// HTTP or HTTPS address of the ground station, if there is an IP path.
     pub url: Option<String>,
+    /// Whose certificates are believed, and what is shown at the ground's door.
+    pub credentials: Credentials,
     /// Whether datagrams go to the same host and port.
     pub datagrams: bool,
     /// The ground's public key: with it, only what the ground signed is believed.
@@ -33,6 +37,10 @@ pub struct MavlinkSigning {
 #[serde(default)]
 pub(super) struct RawGround {
     url: Option<String>,
+    ca: Option<PathBuf>,
+    token_file: Option<PathBuf>,
+    certificate: Option<PathBuf>,
+    key: Option<PathBuf>,
     datagrams: bool,
     public_key: Option<String>,
     agent_system_id: u8,
@@ -43,6 +51,10 @@ impl Default for RawGround {
     fn default() -> Self {
         Self {
             url: None,
+            ca: None,
+            token_file: None,
+            certificate: None,
+            key: None,
             datagrams: true,
             public_key: None,
             agent_system_id: 254,
@@ -56,15 +68,29 @@ impl RawGround {
         if let Some(Err(error)) = self.public_key() {
             checks.problem(format!("ground.public_key: {error}"));
         }
+        if self.certificate.is_some() != self.key.is_some() {
+            checks.problem("ground.certificate and ground.key: one without the other".to_owned());
+        }
     }
 
-    pub fn build(self) -> GroundLinks {
-        GroundLinks {
+    /// With the files that it names, relative ones beside the mission.
+    pub fn build(self, beside: &dyn Fn(&Path) -> PathBuf) -> Result<GroundLinks, Vec<String>> {
+        let path = |path: &Option<PathBuf>| path.as_deref().map(beside);
+        let credentials = Credentials::load(&CredentialFiles {
+            ca: path(&self.ca),
+            token_file: path(&self.token_file),
+            client: path(&self.certificate).zip(path(&self.key)),
+        })?;
+        if let Some(url) = &self.url {
+            HttpLink::with(url, &credentials).map_err(|error| vec![error.in_one_line()])?;
+        }
+        Ok(GroundLinks {
             public_key: self.public_key().and_then(Result::ok),
+            credentials,
             url: self.url,
             datagrams: self.datagrams,
             agent: (self.agent_system_id, self.agent_component_id),
-        }
+        })
     }
 
     fn public_key(&self) -> Option<Result<PublicKey, crate::deliver::keys::KeyError>> {

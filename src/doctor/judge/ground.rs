@@ -21,7 +21,10 @@ pub fn section(seen: &Option<GroundSeen>, autopilot: &AutopilotSeen, mission: &M
     let mut findings = Vec::new();
     let by_ip = seen.as_ref().is_some_and(|seen| seen.test.is_ok());
     match seen {
-        Some(seen) => findings.extend([station(seen), test_alarm(seen)]),
+        Some(seen) => {
+            findings.extend([station(seen), test_alarm(seen)]);
+            findings.extend(seen.datagrams.as_ref().map(datagrams));
+        }
         None => findings.push(Finding::pass(
             "ground station",
             "none by IP in this mission",
@@ -40,7 +43,7 @@ fn station(seen: &GroundSeen) -> Finding {
             "ground station",
             format!("{}, version {}", seen.url, health.version),
         ),
-        Err(error) => Finding::fail("ground station", error.to_string(), remedy_of(error)),
+        Err(error) => Finding::fail("ground station", error.to_string(), error.remedy()),
     }
 }
 
@@ -52,7 +55,24 @@ fn test_alarm(seen: &GroundSeen) -> Finding {
             "this ground station knows no test alarms",
             "bring the ground station to the version of the service",
         ),
-        Err(error) => Finding::fail("test alarm", error.to_string(), remedy_of(error)),
+        Err(error) => Finding::fail("test alarm", error.to_string(), error.remedy()),
+    }
+}
+
+/// Without them alarms go by HTTP alone: they arrive, but a lossy link delays them by seconds.
+fn datagrams(answered: &Result<Duration, String>) -> Finding {
+    match answered {
+        Ok(took) => Finding::pass(
+            "datagrams",
+            format!("answered in {:.0} ms", took.as_secs_f64() * 1e3),
+        ),
+        Err(problem) => Finding::warn(
+            "datagrams",
+            format!("{problem}; alarms go by HTTP alone"),
+            "at the ground, give [[uav]] our name and public_key (emberfix keys MISSION prints it; beyond \
+             loopback a ground without any takes no datagrams) and let UDP through to the port of \
+             ground.url; or set ground.datagrams = false",
+        ),
     }
 }
 
@@ -75,19 +95,6 @@ fn told(took: Duration) -> Finding {
         Bound::AtMost(ROUND_TRIP_S.usable * 1e3),
         1,
     ))
-}
-
-fn remedy_of(error: &HttpError) -> &'static str {
-    match error {
-        HttpError::Url { .. } => "set ground.url to http://HOST:PORT",
-        HttpError::Unreachable { .. } => {
-            "start it (emberfix ground missions/ground.toml) and look at network and VPN"
-        }
-        HttpError::Forged { .. } => "correct ground.public_key, or find out who answers",
-        HttpError::Refused { .. } | HttpError::NoReceipt { .. } => {
-            "something else answers at this address, or it refuses us: look at its log"
-        }
-    }
 }
 
 fn agent(autopilot: &AutopilotSeen, mission: &Mission, by_ip: bool) -> Finding {

@@ -1,10 +1,18 @@
 //! The ground station over IP: does it live, and does a test alarm get through.
 
 use crate::alarm::{Alarm, AlarmClass, AlarmProperties, FireState, Method};
+use crate::deliver::datagram::wire::{Ask, RECEIVE_BUFFER, ToAircraft, ToGround};
+use crate::deliver::envelope::Origin;
 use crate::deliver::http::{HttpError, HttpLink};
+use crate::deliver::keys::SecretKey;
 use crate::mission::Mission;
+use crate::service::courier::connect;
 use emberfix_frames::{Geoid, ServiceTime, SignedDuration, Wgs84Parts};
 use std::time::{Duration, Instant};
+
+/// Between two datagrams that ask, and longest wait for an answer to any.
+const DATAGRAM_RETRY: Duration = Duration::from_millis(200);
+const DATAGRAM_PATIENCE: Duration = Duration::from_secs(2);
 
 /// What the ground station showed.
 #[derive(Debug)]
@@ -15,6 +23,8 @@ pub struct GroundSeen {
     pub health: Result<GroundHealth, HttpError>,
     /// A test alarm, there and back; or why not.
     pub test: Result<Duration, HttpError>,
+    /// A datagram, there and back; or why not. None where the mission wants none, or nobody is there.
+    pub datagrams: Option<Result<Duration, String>>,
 }
 
 /// The ground's own word.
@@ -30,16 +40,16 @@ pub struct GroundHealth {
 #[must_use]
 pub fn ask(mission: &Mission, now: ServiceTime) -> Option<GroundSeen> {
     let url = mission.ground.url.clone()?;
-    let link = match HttpLink::new(&url) {
+    let ask = || HttpLink::with(&url, &mission.ground.credentials);
+    let link = match ask() {
         Ok(link) => link,
         Err(error) => {
-            let again = HttpLink::new(&url)
-                .err()
-                .unwrap_or(HttpError::Url { url: url.clone() });
+            let again = ask().err().unwrap_or(HttpError::Url { url: url.clone() });
             return Some(GroundSeen {
                 url,
                 health: Err(error),
                 test: Err(again),
+                datagrams: None,
             });
         }
     };
@@ -52,7 +62,59 @@ pub fn ask(mission: &Mission, now: ServiceTime) -> Option<GroundSeen> {
     let test = link
         .send_test(&test_alarm(mission, now))
         .map(|()| begun.elapsed());
-    Some(GroundSeen { url, health, test })
+    let wanted = mission.ground.datagrams && health.is_ok();
+    let datagrams = wanted.then(|| datagram(mission, &link.place()));
+    Some(GroundSeen {
+        url,
+        health,
+        test,
+        datagrams,
+    })
+}
+
+/// Asks by datagram for operators' actions after the last that can be: it is signed as alarms are, and
+/// changes nothing at the ground.
+fn datagram(mission: &Mission, place: &str) -> Result<Duration, String> {
+    let key_file = mission.key_file();
+    let key = key_file
+        .exists()
+        .then(|| SecretKey::load_or_make(&key_file))
+        .transpose()
+        .map_err(|error| error.to_string())?;
+    let stamp = rand::random();
+    let ask = ToGround::Ask(Ask {
+        origin: Origin {
+            uav: mission.uav.clone(),
+            outbox: 0,
+        },
+        stamp,
+        after: i64::MAX.cast_unsigned(),
+    });
+    let said = |error: std::io::Error| format!("{place}: {error}");
+    let socket = connect(place, DATAGRAM_RETRY).map_err(said)?;
+    let begun = Instant::now();
+    let mut buffer = vec![0; RECEIVE_BUFFER];
+    while begun.elapsed() < DATAGRAM_PATIENCE {
+        let sent = Instant::now();
+        // What nobody listens to is refused on the next call; that, too, is no answer.
+        if socket.send(&ask.datagram(key.as_ref())).is_ok()
+            && let Ok(length) = socket.recv(&mut buffer)
+            && let Ok((ToAircraft::Actions { stamp: told, .. }, signed)) =
+                ToAircraft::read(&buffer[..length])
+            && told == stamp
+        {
+            let ours = mission.ground.public_key;
+            return match ours.is_none_or(|ground| signed.is_by(&ground)) {
+                true => Ok(sent.elapsed()),
+                false => Err("the answer is not signed by ground.public_key".to_owned()),
+            };
+        }
+        std::thread::sleep(DATAGRAM_RETRY.saturating_sub(sent.elapsed()));
+    }
+    Err(match key {
+        Some(key) => format!("no answer at {place}; our public key is {}", key.public()),
+        None => format!("no answer at {place}; this aircraft has no key yet"),
+    })
 }
 
 /// An alarm that nobody can take for a real one: its id ends in `-test`, its reasons say so, and it

@@ -2,6 +2,7 @@
 //! up. Says on standard output what it put, once the outbox has it.
 
 use super::DeliveryError;
+use super::quic::{self, Congestion};
 use crate::alarm::{Alarm, AlarmClass, AlarmProperties, FireId, FireState, Method};
 use crate::deliver::keys::{PublicKey, SecretKey};
 use crate::deliver::{DatagramDelivery, Outbox, Owner, alarm_id};
@@ -34,6 +35,12 @@ pub struct AircraftArguments {
     /// Without datagrams: HTTP alone.
     #[arg(long)]
     pub http_only: bool,
+    /// QUIC instead, to who has this certificate (DER).
+    #[arg(long)]
+    pub quic: Option<PathBuf>,
+    /// How QUIC lets itself send.
+    #[arg(long, default_value = "cubic")]
+    pub congestion: Congestion,
     /// Between two alarms, milliseconds.
     #[arg(long)]
     pub every_ms: u64,
@@ -60,30 +67,50 @@ pub fn fly(arguments: &AircraftArguments) -> Result<(), DeliveryError> {
         key: Some(key.clone()),
     };
     let outbox = Outbox::open(&path, &[DatagramDelivery::NAME], owner)?;
-    let links = GroundLinks {
-        url: Some(arguments.ground.clone()),
-        datagrams: !arguments.http_only,
-        public_key: Some(arguments.ground_key),
-        agent: (254, 191),
-    };
-    let courier = IpCourier::new(&links, outbox.origin(), Some(key), rand::random());
     let board = Arc::new(Board::default());
     let outbox = Arc::new(Mutex::new(outbox));
-    let around = Surroundings {
-        outbox: Arc::clone(&outbox),
-        board: Arc::clone(&board),
-        clock: service_clock(),
-        events: None,
+    let thread = match &arguments.quic {
+        None => start_courier(arguments, &outbox, key, &board)?,
+        Some(certificate) => {
+            let place = arguments.ground.trim_start_matches("http://");
+            let to = place.parse().map_err(|_| DeliveryError::Thread)?;
+            let (outbox, board) = (Arc::clone(&outbox), Arc::clone(&board));
+            quic::carry(outbox, board, to, certificate, arguments.congestion)?
+        }
     };
-    let courier = courier.ok().flatten().ok_or(DeliveryError::Thread)?;
-    let thread = courier
-        .start(around)
-        .map_err(super::io("start the courier"))?;
     say("ready");
     put_until_told(arguments, &outbox)?;
     wait_until_empty(&outbox)?;
     board.stop();
     thread.join().map_err(|_| DeliveryError::Thread)
+}
+
+/// What the service itself sends with.
+fn start_courier(
+    arguments: &AircraftArguments,
+    outbox: &SharedOutbox,
+    key: SecretKey,
+    board: &Arc<Board>,
+) -> Result<std::thread::JoinHandle<()>, DeliveryError> {
+    let links = GroundLinks {
+        url: Some(arguments.ground.clone()),
+        credentials: crate::deliver::Credentials::default(),
+        datagrams: !arguments.http_only,
+        public_key: Some(arguments.ground_key),
+        agent: (254, 191),
+    };
+    let origin = lock(outbox).origin();
+    let courier = IpCourier::new(&links, origin, Some(key), rand::random());
+    let around = Surroundings {
+        outbox: Arc::clone(outbox),
+        board: Arc::clone(board),
+        clock: service_clock(),
+        events: None,
+    };
+    let courier = courier.ok().flatten().ok_or(DeliveryError::Thread)?;
+    courier
+        .start(around)
+        .map_err(super::io("start the courier"))
 }
 
 type SharedOutbox = Arc<Mutex<Outbox>>;
