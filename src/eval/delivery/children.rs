@@ -1,6 +1,7 @@
 //! The two sides as processes, to be killed and started again.
 
 use super::proxy::one_port;
+use super::quic::Congestion;
 use super::{DeliveryError, io};
 use crate::deliver::keys::{PublicKey, SecretKey};
 use std::io::{BufRead as _, BufReader};
@@ -152,7 +153,17 @@ pub(super) struct Behaviour {
     pub uav: String,
     pub every_ms: u64,
     pub revisions: f64,
-    pub http_only: bool,
+    pub way: Way,
+}
+
+/// By which of the ways over IP.
+#[derive(Debug, Clone)]
+pub(super) enum Way {
+    /// As the service does it: datagrams, HTTP beside them.
+    Datagrams,
+    Http,
+    /// To who has this certificate.
+    Quic(PathBuf, Congestion),
 }
 
 /// An aircraft, its folder, and what it put over all its lives.
@@ -214,7 +225,7 @@ impl Aircraft {
             uav,
             every_ms,
             revisions,
-            http_only,
+            way,
         } = &self.behaviour;
         let mut command = ourselves()?;
         command
@@ -232,8 +243,15 @@ impl Aircraft {
             .args(["--seed", &self.lives.to_string()])
             .arg("--folder")
             .arg(&self.folder);
-        if *http_only {
-            command.arg("--http-only");
+        match way {
+            Way::Datagrams => {}
+            Way::Http => {
+                command.arg("--http-only");
+            }
+            Way::Quic(certificate, congestion) => {
+                command.arg("--quic").arg(certificate);
+                command.args(["--congestion", congestion.name()]);
+            }
         }
         command
             .env("EMBERFIX_LOG", "error")

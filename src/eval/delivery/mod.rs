@@ -12,7 +12,7 @@
 //! **TCP.** A proxy can't lose segments of a TCP connection, so their loss is modelled: a lost segment
 //! holds up what is behind it for a retransmission timeout of 200 ms (Linux's least), which doubles
 //! with each further loss (RFC 6298); acknowledgements are never lost, and nothing else slows it. That
-//! flatters TCP.
+//! flatters TCP. Datagrams and QUIC (`quic`) lose the real thing.
 
 pub mod aircraft;
 mod audit;
@@ -21,6 +21,7 @@ mod disk;
 mod latency;
 mod outage;
 mod proxy;
+pub mod quic;
 mod slaughter;
 
 use crate::eval::{Report, Table};
@@ -44,7 +45,7 @@ impl Options {
     #[must_use]
     pub fn steps(&self) -> u64 {
         let steps = |part: &Part| match part {
-            Part::Latency => 4,
+            Part::Latency => latency::CASES,
             Part::Kills if self.quick => slaughter::KILLS.1,
             Part::Kills => slaughter::KILLS.0,
             Part::Disk => 3,

@@ -1,7 +1,7 @@
 //! A long outage, really waited for, and how quickly everything is there after it.
 
 use super::audit::{Watch, compare};
-use super::children::{Aircraft, Behaviour, Ground, Put};
+use super::children::{Aircraft, Behaviour, Ground, Put, Way};
 use super::proxy::{Proxy, Weather};
 use super::{DeliveryError, Found, Options};
 use emberfix_report::{Bound, Figure};
@@ -27,7 +27,7 @@ pub(super) fn measure(options: &Options, folder: &Path) -> Result<Found, Deliver
         uav: UAV.to_owned(),
         every_ms: 2_000,
         revisions: 0.3,
-        http_only: false,
+        way: Way::Datagrams,
     };
     let mut aircraft = Aircraft::start(&home, behaviour, proxy.address, ground.key)?;
     std::thread::sleep(BEFORE);

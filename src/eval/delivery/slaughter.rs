@@ -1,7 +1,7 @@
 //! Random SIGKILLs of either side in wild weather; and beside it, in a fleet of its own, the outage.
 
 use super::audit::compare;
-use super::children::{Aircraft, Behaviour, Ground};
+use super::children::{Aircraft, Behaviour, Ground, Way};
 use super::proxy::{Proxy, Weather};
 use super::{Audit, DeliveryError, Found, Options, Told, outage};
 use crate::eval::Table;
@@ -90,7 +90,7 @@ fn run(seed: u64, folder: &Path, another: &dyn Fn() -> bool) -> Result<Killed, D
         uav: UAV.to_owned(),
         every_ms: 25,
         revisions: 0.4,
-        http_only: false,
+        way: Way::Datagrams,
     };
     let mut aircraft = Aircraft::start(&home, behaviour, proxy.address, ground.key)?;
     let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
