@@ -1,23 +1,32 @@
-//! A real browser in front of the ground station's page: the real `emberfix ground`, alarms over HTTP,
-//! Chromium. Exit code 77 of the client means that there is no browser here.
+//! A real browser in front of the ground station's page: the real `emberfix ground`, alarms over HTTP or
+//! of the real service in flight, Chromium. Exit code 77 of the client means that there is no browser here.
 
 #![expect(clippy::unwrap_used, reason = "a test may stop at its first surprise")]
 
+#[path = "support/camera.rs"]
+#[expect(dead_code, reason = "it films to the end")]
+mod camera;
 #[path = "support/clients.rs"]
 #[expect(dead_code, reason = "no client states facts here")]
 mod clients;
+#[path = "support/live.rs"]
+mod live;
+#[path = "support/pictures.rs"]
+#[expect(dead_code, reason = "no lens is covered here")]
+mod pictures;
 #[path = "support/station.rs"]
 #[expect(dead_code, reason = "only the browser acts here")]
 mod station;
-#[expect(dead_code, reason = "no mission is flown here")]
+#[expect(dead_code, reason = "what clients say is read as it comes")]
 mod support;
 
 use clients::{Clients, Running};
+use live::Service;
 use serde_json::{Value, json};
 use station::{Station, eventually, fire};
 use std::process::Command;
 use std::time::{SystemTime, UNIX_EPOCH};
-use support::{Said, root};
+use support::{PLAIN_MISSION, Said, Scratch, root};
 
 /// The browser, ready to be given arguments; with axe-core where Node brought it.
 fn browser(clients: &Clients, station: &Station) -> Command {
@@ -179,5 +188,84 @@ fn a_lost_line_is_shown_with_the_age_of_what_is_seen() {
     assert!(
         seen["title"].as_str().unwrap().contains("No connection"),
         "{seen:#}"
+    );
+}
+
+/// Resolves to the width of the fire's picture, pixels, once the page shows it.
+const PICTURE: &str = "new Promise(done => { const look = setInterval(() => { \
+    const image = document.querySelector('.chip img'); \
+    if (image?.complete && image.naturalWidth > 0) { clearInterval(look); done(image.naturalWidth); } }, 50); })";
+
+/// Camera and autopilot, the real service, the real ground station, a person at the page: what she does is
+/// on the aircraft's disk while it flies, and she sees what the aircraft saw.
+#[test]
+fn what_an_operator_does_on_the_page_reaches_the_aircraft_in_flight_and_she_sees_its_picture() {
+    let Some(clients) = Clients::find() else {
+        return;
+    };
+    let station = Station::start("");
+    let scratch = Scratch::new();
+    scratch.write(
+        "mission.toml",
+        format!("{PLAIN_MISSION}[ground]\nurl = \"{}\"\n", station.url),
+    );
+    let recording = scratch.path("flight.mcap");
+    let service = Service::start(&scratch, &["--record", recording.to_str().unwrap()]);
+    let mut pilot = clients.client("mav_autopilot.py");
+    pilot.args([
+        "--seconds",
+        "120",
+        "--port",
+        &service.mavlink_port.to_string(),
+    ]);
+    let (_pilot, _) = Running::start(pilot, "ready ");
+    let _camera = service.film();
+    let mut browser = browser(&clients, &station);
+    let picture = format!("eval:{PICTURE}");
+    for step in [
+        "wait:uav-1-1",
+        "key:j",
+        "key:a",
+        "fill:#name=Ana",
+        "click:#name-dialog button[value=ok]",
+        "wait:Acknowledged by Ana",
+        &picture,
+    ] {
+        browser.args(["--do", step]);
+    }
+    let seen = seen(&Said::of(&browser.output().unwrap()));
+    let known = |health: &Value| health["wire"]["outboxes"][0]["actions_known"].as_u64() >= Some(1);
+    let health = match seen.is_some() {
+        true => eventually(|| station.get("/health"), known),
+        false => return,
+    };
+    let log = service.stop().err;
+    assert!(known(&health), "{health:#}");
+    assert!(
+        log.contains("an operator acted") && log.contains("Acknowledge"),
+        "{log}"
+    );
+    let recorded = std::fs::read(&recording).unwrap();
+    let topic = b"/operator/action";
+    assert!(
+        recorded.windows(topic.len()).any(|part| part == topic),
+        "it is recorded"
+    );
+
+    let width = seen.unwrap()["steps"].as_array().unwrap().last().unwrap()["value"].as_u64();
+    let url = format!("{}/incidents/uav-1-1/chip.jpg", station.url);
+    let jpeg = ureq::get(url)
+        .call()
+        .unwrap()
+        .body_mut()
+        .read_to_vec()
+        .unwrap();
+    println!("a picture of {} bytes, {width:?} pixels wide", jpeg.len());
+    assert!(jpeg.len() <= 4_096);
+    let picture = image::load_from_memory(&jpeg).unwrap();
+    assert_eq!(
+        Some(u64::from(picture.width())),
+        width,
+        "what the page shows"
     );
 }

@@ -11,7 +11,7 @@ import random
 import struct
 import time
 
-from mavclient import Book, Clock, Schedule, UdpLink, mavlink, print_json, say_ready
+from mavclient import Book, Clock, Schedule, UdpLink, mavlink, print_json, say_ready, secret
 
 SYSTEM, COMPONENT = 1, 1
 EARTH_RADIUS_M = 6_378_137.0
@@ -78,6 +78,9 @@ class Autopilot:
         self.boot_ns = self.began_ns - int(args.boot_age_s * 1e9)
         self.rebooted = False
         self.companion = UdpLink(SYSTEM, COMPONENT, send_to=f"{args.host}:{args.port}")
+        if args.sign:
+            newest = {(0, SYSTEM, 191): args.newest_of_companion} if args.newest_of_companion else None
+            self.companion.sign(args.sign, 0, newest)
         self.ground = args.ground_port and UdpLink(
             SYSTEM, COMPONENT, send_to=f"{args.host}:{args.ground_port}"
         )
@@ -89,6 +92,7 @@ class Autopilot:
         self.random = random.Random(args.seed)
         self.sent = {}
         self.intervals = []
+        self.recorded = None
         self.timesync_requests = 0
         self.timesync_replies = []
         self.forwarded = {"to_ground": 0, "to_companion": 0}
@@ -137,6 +141,8 @@ class Autopilot:
         if message is None:
             return
         self.companion.send(message)
+        if message_id == mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION:
+            self.recorded = message.get_msgbuf()
         if self.ground:
             self.ground.write(message.get_msgbuf())
         name = message.get_type()
@@ -316,6 +322,8 @@ class Autopilot:
                 "last_replies": self.timesync_replies[-3:],
             },
             "forwarded": self.forwarded,
+            "signatures": self.companion.signatures() if self.args.sign else None,
+            "last_attitude": self.recorded and bytes(self.recorded).hex(),
             "ground": self.ground_book.summary() if self.ground else None,
         }
 
@@ -332,6 +340,8 @@ def arguments():
     )
     add("--seconds", type=float, default=10.0, help="how long; SIGTERM ends it sooner, with its summary")
     add("--seed", type=int, default=1)
+    add("--sign", type=secret, metavar="FILE", help="sign towards the companion, with the secret in FILE")
+    add("--newest-of-companion", type=int, metavar="TIME", help="of its signatures that were seen before")
 
     flight = parser.add_argument_group("flight")
     add = flight.add_argument

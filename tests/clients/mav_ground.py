@@ -8,7 +8,7 @@ the alarms that come as COMMAND_INT MAV_CMD_SPATIAL_USER_1.
 import argparse
 import time
 
-from mavclient import Book, Clock, Schedule, UdpLink, mavlink, print_json, say_ready
+from mavclient import Book, Clock, Schedule, UdpLink, mavlink, print_json, say_ready, secret
 
 STATION = (255, 190)
 
@@ -23,6 +23,8 @@ class Ground:
         self.args = args
         where = {"send_to": args.connect} if args.connect else {"bind": f"127.0.0.1:{args.port}"}
         self.link = UdpLink(*STATION, **where)
+        if args.sign:
+            self.link.sign(args.sign, 2)
         self.book = Book()
         self.acknowledged = []
         self.ignored = 0
@@ -111,6 +113,7 @@ def arguments():
     add("--ack-as", type=identity, metavar="SYSTEM/COMPONENT", help="e.g. 254/191: acknowledge alarms to it")
     add("--as-autopilot", action="store_true", help="claim to be one: what must never be sent markers")
     add("--ignore-first", type=int, default=0, metavar="N", help="leave the first N alarms unanswered")
+    add("--sign", type=secret, metavar="FILE", help="sign, with the secret in FILE, and take nothing unsigned")
     add("--vehicle", type=int, default=1, help="system id to ask for messages")
     add("--request-geo-status-hz", type=float, default=0.0, metavar="HZ")
     add(

@@ -32,6 +32,25 @@ class UdpLink:
         self.mav = self._connection.mav
         self._waits_for_peer = send_to is None
 
+    def sign(self, secret, link_id, newest=None):
+        """Signs what it sends, and takes nothing that is not signed with the same secret.
+
+        `newest` of a stream (link id, system, component) is the latest time that was seen of it before.
+        """
+        self._connection.setup_signing(secret, sign_outgoing=True, link_id=link_id)
+        self.mav.signing.stream_timestamps.update(newest or {})
+
+    def signatures(self):
+        """What pymavlink counted, and each stream's latest time."""
+        signing = self.mav.signing
+        return {
+            "good": signing.goodsig_count,
+            "bad": signing.badsig_count,
+            "unsigned": signing.unsigned_count,
+            "rejected": signing.reject_count,
+            "newest": {"/".join(map(str, stream)): at for stream, at in signing.stream_timestamps.items()},
+        }
+
     @property
     def port(self):
         return self._connection.port.getsockname()[1]
@@ -138,6 +157,12 @@ class Book:
             "bad_data": self.bad_data,
             **self.kept,
         }
+
+
+def secret(text):
+    """32 bytes from a file of 64 hexadecimal digits."""
+    with open(text, encoding="ascii") as file:
+        return bytes.fromhex(file.read().strip())
 
 
 def plain(value):

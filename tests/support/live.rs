@@ -5,6 +5,7 @@ use crate::clients::Running;
 use crate::pictures;
 use crate::support::{Said, Scratch, emberfix};
 use std::net::{TcpListener, UdpSocket};
+use std::path::Path;
 
 /// The service on ports of its own.
 pub struct Service {
@@ -14,7 +15,8 @@ pub struct Service {
     camera_port: u16,
 }
 
-fn free_udp_port() -> u16 {
+/// A port of this computer that nobody has just now.
+pub fn free_udp_port() -> u16 {
     UdpSocket::bind("127.0.0.1:0")
         .unwrap()
         .local_addr()
@@ -33,10 +35,16 @@ fn free_tcp_port() -> u16 {
 impl Service {
     /// Starts it on the scratch folder's mission, with a box file as its detector.
     pub fn start(scratch: &Scratch, more: &[&str]) -> Self {
+        Self::start_with(scratch, more, &[])
+    }
+
+    /// The same, in an environment of its own.
+    pub fn start_with(scratch: &Scratch, more: &[&str], environment: &[(&str, &Path)]) -> Self {
         let (mavlink_port, camera_port) = (free_udp_port(), free_tcp_port());
         let mut command = emberfix();
         command
             .env("EMBERFIX_LOG", "info")
+            .envs(environment.iter().copied())
             .arg("run")
             .arg(scratch.path("mission.toml"));
         command
