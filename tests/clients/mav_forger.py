@@ -25,14 +25,22 @@ def links(args):
 
 def turned():
     """Lies on its back: whoever believed it would lose every position."""
-    return mavlink.MAVLink_attitude_quaternion_message(int(time.monotonic() * 1e3) & 0xFFFFFFFF, 0, 1, 0, 0, 0, 0, 0)
+    return mavlink.MAVLink_attitude_quaternion_message(
+        int(time.monotonic() * 1e3) & 0xFFFFFFFF, 0, 1, 0, 0, 0, 0, 0
+    )
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     add = parser.add_argument
     add("--port", type=int, required=True, help="UDP port where the companion listens")
-    add("--sign", type=secret, required=True, metavar="FILE", help="the network's secret, for what is recorded")
+    add(
+        "--sign",
+        type=secret,
+        required=True,
+        metavar="FILE",
+        help="the network's secret, for what is recorded",
+    )
     add("--recorded", type=bytes.fromhex, metavar="HEX", help="a frame that passed once")
     add("--rounds", type=int, default=40)
     args = parser.parse_args()

@@ -113,7 +113,9 @@ def arguments():
     add("--ack-as", type=identity, metavar="SYSTEM/COMPONENT", help="e.g. 254/191: acknowledge alarms to it")
     add("--as-autopilot", action="store_true", help="claim to be one: what must never be sent markers")
     add("--ignore-first", type=int, default=0, metavar="N", help="leave the first N alarms unanswered")
-    add("--sign", type=secret, metavar="FILE", help="sign, with the secret in FILE, and take nothing unsigned")
+    add(
+        "--sign", type=secret, metavar="FILE", help="sign, with the secret in FILE, and take nothing unsigned"
+    )
     add("--vehicle", type=int, default=1, help="system id to ask for messages")
     add("--request-geo-status-hz", type=float, default=0.0, metavar="HZ")
     add(

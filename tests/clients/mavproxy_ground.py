@@ -30,7 +30,15 @@ class Proxy:
 
     def __init__(self, args, folder):
         program = Path(sys.executable).parent / "mavproxy.py"
-        command = [sys.executable, "-u", str(program), "--state-basedir", folder, "--logfile", f"{folder}/mav.tlog"]
+        command = [
+            sys.executable,
+            "-u",
+            str(program),
+            "--state-basedir",
+            folder,
+            "--logfile",
+            f"{folder}/mav.tlog",
+        ]
         for master in args.master:
             command += ["--master", master]
         for module in args.module:
