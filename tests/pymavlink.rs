@@ -290,7 +290,8 @@ fn signed_mission(scratch: &Scratch) -> String {
 /// A number in what the service logged last about frames that it refused.
 fn refused(log: &str, name: &str) -> u64 {
     let last = log.lines().rfind(|line| line.contains("frame was refused"));
-    let last = last.unwrap_or_else(|| panic!("nothing was refused: {log}"));
+    assert!(last.is_some(), "nothing was refused: {log}");
+    let last = last.unwrap();
     let at = last.find(&format!(" {name}: ")).unwrap() + name.len() + 3;
     let digits = last[at..].chars().take_while(char::is_ascii_digit);
     digits.collect::<String>().parse().unwrap()

@@ -72,7 +72,7 @@ pub enum Eval {
     Delivery(delivery::DeliveryArguments),
     /// The aircraft of `delivery`, in a process of its own.
     #[command(hide = true)]
-    DeliveryAircraft(crate::eval::delivery::aircraft::AircraftArguments),
+    DeliveryAircraft(Box<crate::eval::delivery::aircraft::AircraftArguments>),
 }
 
 /// Measures one of them.

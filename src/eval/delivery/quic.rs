@@ -1,8 +1,8 @@
 //! QUIC, measured beside what we ship; it is no link of ours.
 //!
 //! Each alarm goes on a stream of its own over one connection, so that none waits for another one's lost
-//! packets; its receipt comes back on the same stream. The aircraft's end ([`carry`]) empties the real
-//! outbox; the ground's end ([`Relay`]) hands each alarm to the real station over HTTP on this computer, and
+//! packets; its receipt comes back on the same stream. The aircraft's end (`carry`) empties the real
+//! outbox; the ground's end (`Relay`) hands each alarm to the real station over HTTP on this computer, and
 //! answers when that has its receipt. That hop costs about a millisecond.
 //!
 //! **Chosen for it:** a first guess of 100 ms for the way there and back (the library's is 333 ms), a
