@@ -155,7 +155,6 @@ fn png(folder: &Path, name: &str) -> Bytes {
 }
 
 #[test]
-#[ignore = "its pictures do not cover the corners, so that it waits in vain; see the test of `Wanted`"]
 fn before_a_camera_it_says_what_is_missing_and_ends_when_there_is_enough() {
     let Some(clients) = Clients::find() else {
         return;

@@ -17,7 +17,7 @@ SIZE = (640, 480)
 LEFT = np.array([[520.0, 0, 322.0], [0, 520.0, 238.0], [0, 0, 1]])
 RIGHT = np.array([[517.0, 0, 316.0], [0, 517.0, 243.0], [0, 0, 1]])
 TURN = cv2.Rodrigues(np.radians([0.4, -0.7, 0.3]))[0]
-MOVE = np.array([-0.12, 0.0006, -0.0011])
+MOVE = np.array([-0.075, 0.0006, -0.0011])
 SQUARE_M, MARKER_M = 0.028, 0.021
 SQUARES = (9, 6)  # of the ChArUco board; the chessboard has as many inner corners
 DOT = 40  # pixels of the print a square
@@ -40,17 +40,45 @@ def printed(kind):
     return picture, (columns, rows)
 
 
-def poses(count, reach):
+def poses(count, squares, whole):
     """Everywhere in the picture, facing and tilted each way, near and far."""
     tilts = [(0, 0), (32, 0), (-32, 0), (0, 32), (0, -32)]
     places = [(x, y) for y in (-1, 0, 1) for x in (-1, 0, 1)]
+    # Eyes that stand apart share little of what is near: only a far board comes to both pictures' sides.
+    depths = (0.34, 0.85, 0.5) if whole else (0.34, 0.55, 0.42)
     for k in range(count):
         x, y = places[(4 * k) % 9]
         about_x, about_y = tilts[k % 5]
-        depth = (0.34, 0.55, 0.42)[(k // 2) % 3]
+        depth = depths[(k // 2) % 3]
         turn = cv2.Rodrigues(np.radians([about_x + k % 7, about_y, 3.0 * (k % 4) - 4]))[0]
-        across = reach * x * 0.30 * depth - 0.5 * MOVE[0]  # midway between the eyes
-        yield turn, np.array([across, reach * y * 0.20 * depth, depth])
+        yield turn, placed(turn, squares, (x, y), depth) if whole else hung_out(x, y, depth)
+
+
+def hung_out(x, y, depth):
+    """The middle of a board that hangs out of the pictures here and there."""
+    return np.array([0.375 * x * depth - 0.5 * MOVE[0], 0.25 * y * depth, depth])
+
+
+def placed(turn, squares, towards, depth):
+    """The middle of a board that is as far towards a corner or side of the pictures as both see it whole."""
+    while True:
+        for share in np.arange(1.0, -0.01, -0.05):
+            x, y = share * np.array(towards) * np.array(SIZE) / 2 / LEFT[0, 0] * depth
+            middle = np.array([x - 0.5 * MOVE[0], y, depth])
+            if is_whole(turn, squares, middle):
+                return middle
+        depth *= 1.02
+
+
+def is_whole(turn, squares, middle, margin_px=3):
+    half = (np.array(squares) / 2 + 0.15) * SQUARE_M
+    outline = np.array([[a * half[0], b * half[1], 0] for a in (-1, 1) for b in (-1, 1)])
+    for camera, rotate, move in ((LEFT, np.eye(3), np.zeros(3)), (RIGHT, TURN, MOVE)):
+        seen_at = (rotate @ (turn @ outline.T + middle[:, None]) + move[:, None]).T @ camera.T
+        pixels = seen_at[:, :2] / seen_at[:, 2:]
+        if (pixels < margin_px).any() or (pixels > np.array(SIZE) - margin_px).any():
+            return False
+    return True
 
 
 def seen(picture, squares, camera, turn, middle):
@@ -76,9 +104,8 @@ def main():
     folder, kind = Path(sys.argv[1]), sys.argv[2]
     count = int(sys.argv[3]) if len(sys.argv) > 3 else 30
     picture, squares = printed(kind)
-    reach = 1.25 if kind == "charuco" else 0.55
     folder.mkdir(parents=True, exist_ok=True)
-    for k, (turn, middle) in enumerate(poses(count, reach)):
+    for k, (turn, middle) in enumerate(poses(count, squares, kind == "chess")):
         left = seen(picture, squares, LEFT, turn, middle)
         right = seen(picture, squares, RIGHT, TURN @ turn, TURN @ middle + MOVE)
         cv2.imwrite(str(folder / f"left_{k + 1:03}.png"), left)

@@ -69,8 +69,9 @@ fn spacing_px(points: &Vector<Point2f>, columns: usize) -> f64 {
     in_rows.chain(in_columns).fold(f64::INFINITY, f64::min)
 }
 
-/// Share of a square that the refining window's half reaches: more takes in the next corner.
-const WINDOW_SHARE: f64 = 0.4;
+/// Share of a square that the refining window's half reaches: the longest edges that belong to no other
+/// corner's window, and so the least noise.
+const WINDOW_SHARE: f64 = 0.5;
 
 /// Moves the corners to where the image's gradients point, in a window that fits the squares.
 fn refine(image: &Mat, points: &mut Vector<Point2f>, spacing_px: f64) -> Result<()> {

@@ -13,8 +13,8 @@ pub(super) struct Weights {
     pub turn_rad: f64,
     /// Moves of the board between the eyes, per axis, metres.
     pub move_m: f64,
-    /// For each view, how much firmer than that its board is held.
-    pub of_view: Vec<f64>,
+    /// For each view, how much firmer than that its board is held: against turns, against moves.
+    pub of_view: Vec<[f64; 2]>,
 }
 
 /// Where the search begins: hands are still to a tenth of a degree and a fifth of a millimetre.
@@ -26,9 +26,10 @@ const STILL_MOVE_M: f64 = 1e-8;
 /// Corners that fit perfectly have noise all the same: a thousandth of a pixel.
 const LEAST_CORNER_PX: f64 = 1e-3;
 /// Degrees of freedom of Student's distribution of the steps: hands hold still, and now and then do not.
+/// Turns and moves each have theirs: a hand that twists a board has not therefore shifted it.
 const FREEDOM: f64 = 2.0;
-/// Numbers of a step.
-const PARTS: f64 = 6.0;
+/// Numbers of a turn, and of a move.
+const PARTS: f64 = 3.0;
 
 impl Weights {
     pub(super) fn first(views: usize, moving_board: bool) -> Self {
@@ -41,7 +42,7 @@ impl Weights {
             corner_px: [0.2; 2],
             turn_rad,
             move_m,
-            of_view: vec![1.0; views],
+            of_view: vec![[1.0; 2]; views],
         }
     }
 
@@ -52,7 +53,10 @@ impl Weights {
     /// Of a view's turn, of its move.
     pub(super) fn of_step(&self, view: usize) -> [f64; 2] {
         let firmer = self.of_view[view];
-        [firmer / self.turn_rad.powi(2), firmer / self.move_m.powi(2)]
+        [
+            firmer[0] / self.turn_rad.powi(2),
+            firmer[1] / self.move_m.powi(2),
+        ]
     }
 
     /// Whether another round would change nothing that counts.
@@ -77,7 +81,7 @@ impl Weights {
         for (at, view) in of.views.iter().enumerate() {
             let variance = inverse(&view.own)?.diagonal();
             let part = Steps::of_view(self, state, at, |index| variance[STEP + index]);
-            of_view.push((FREEDOM + PARTS) / (FREEDOM + part.distance));
+            of_view.push(part.distance.map(|distance| (FREEDOM + PARTS) / (FREEDOM + distance)));
             steps.add(&part);
         }
         let mut next = Self {
@@ -130,7 +134,7 @@ struct Steps {
     move_squares: f64,
     turn_seen: f64,
     move_seen: f64,
-    distance: f64,
+    distance: [f64; 2],
 }
 
 impl Steps {
@@ -146,12 +150,12 @@ impl Steps {
         for axis in 0..3 {
             let (turned, moved) = (step.turn_rad[axis], step.move_m[axis]);
             let (turn_variance, move_variance) = (variance(axis), variance(3 + axis));
-            sum.turn_squares += firmer * turned * turned;
-            sum.move_squares += firmer * moved * moved;
+            sum.turn_squares += firmer[0] * turned * turned;
+            sum.move_squares += firmer[1] * moved * moved;
             sum.turn_seen += (1.0 - turn * turn_variance).max(0.0);
             sum.move_seen += (1.0 - way * move_variance).max(0.0);
-            sum.distance += (turned * turned + turn_variance) * turn / firmer
-                + (moved * moved + move_variance) * way / firmer;
+            sum.distance[0] += (turned * turned + turn_variance) * turn / firmer[0];
+            sum.distance[1] += (moved * moved + move_variance) * way / firmer[1];
         }
         sum
     }

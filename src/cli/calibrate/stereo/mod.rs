@@ -9,7 +9,6 @@ use crate::cli::Failure;
 use anyhow::anyhow;
 use emberfix_calib::solve::{Board, Calibration, Demands, Model, calibrate};
 use emberfix_calib::{Calibrated, PageInput, RigParts, page};
-use emberfix_frames::ServiceTime;
 use indicatif::ProgressBar;
 use look::Looked;
 use std::path::PathBuf;
@@ -156,9 +155,8 @@ fn rig_name(arguments: &StereoArguments) -> String {
 
 /// UTC, whole seconds.
 fn now() -> String {
-    let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
-    let seconds = since.map_or(0, |since| since.as_secs() as i64);
-    ServiceTime::from_unix_ns(seconds * 1_000_000_000).rfc3339()
+    let now = jiff::Timestamp::now();
+    now.strftime("%Y-%m-%dT%H:%M:%SZ").to_string()
 }
 
 fn report(
