@@ -2,6 +2,9 @@
 
 const RAD = Math.PI / 180;
 
+/** The same direction from -180 to 180 degrees. */
+export const turned = (lon) => ((((lon + 180) % 360) + 360) % 360) - 180;
+
 // Metres east and north of an origin in its tangent plane (radii of curvature of WGS84). Good to a few
 // parts in a thousand within 50 km, which is for drawing only: coordinates in words are the alarm's own.
 export class Plane {
@@ -13,8 +16,7 @@ export class Plane {
   }
 
   xy([lon, lat]) {
-    const turn = ((((lon - this.lon + 180) % 360) + 360) % 360) - 180;
-    return [turn * this.east, (lat - this.lat) * this.north];
+    return [turned(lon - this.lon) * this.east, (lat - this.lat) * this.north];
   }
 
   lonLat([x, y]) {

@@ -2,7 +2,7 @@
 
 import { svg, $ } from "./dom.js";
 import { sexagesimal, decimal, mgrs } from "./coords.js";
-import { Plane, ellipse, graticuleStep, roundLength } from "./geo.js";
+import { Plane, ellipse, graticuleStep, roundLength, turned } from "./geo.js";
 import { isDismissed, isNew, isSilent, known, newestAlarm, sorted } from "./state.js";
 import { STATE, metres, title } from "./words.js";
 import { attribution, tiles } from "./tiles.js";
@@ -94,7 +94,7 @@ function graticule() {
   lines(west, east, (lon, digits) => {
     const [x] = place([lon, south]);
     line(x, 0, x, h);
-    if (x > 190 && x < w - 60) label(x + 4, h - 8, sexagesimal(lon, "E", "W", digits), "start");
+    if (x > 190 && x < w - 60) label(x + 4, h - 8, sexagesimal(turned(lon), "E", "W", digits), "start");
   });
   lines(south, north, (lat, digits) => {
     const [, y] = place([west, lat]);
@@ -218,7 +218,7 @@ function firstPlace(incidents) {
 
 function point([px, py]) {
   if (!plane) return;
-  const [lon, lat] = plane.lonLat(fromScreen(px, py));
+  const [east, lat] = plane.lonLat(fromScreen(px, py)), lon = turned(east);
   $("pointer").textContent = `${decimal(lat, lon)}  ${mgrs(lat, lon) ?? ""}`;
 }
 

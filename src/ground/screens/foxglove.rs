@@ -92,11 +92,17 @@ fn feature(incident: &Incident) -> serde_json::Value {
 }
 
 fn ellipse(incident: &Incident) -> serde_json::Value {
-    let mut corners = view::ellipse90(incident, CORNERS);
-    corners.extend(corners.first().copied());
+    let rings = view::ellipse90(incident, CORNERS);
+    let geometry = match rings.as_slice() {
+        [ring] => serde_json::json!({ "type": "Polygon", "coordinates": [ring] }),
+        rings => {
+            let polygons: Vec<_> = rings.iter().map(|ring| [ring]).collect();
+            serde_json::json!({ "type": "MultiPolygon", "coordinates": polygons })
+        }
+    };
     serde_json::json!({
         "type": "Feature",
-        "geometry": { "type": "Polygon", "coordinates": [corners] },
+        "geometry": geometry,
         "properties": {
             "name": format!("{}: 90 % ellipse", view::callsign(incident)),
             "style": { "color": "#b3260e", "opacity": 0.4 },

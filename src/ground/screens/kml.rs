@@ -101,11 +101,10 @@ fn placemark(incident: &Incident) -> Element {
     let point = Element::new("Point")
         .field("altitudeMode", "absolute")
         .field("coordinates", coordinates);
-    let shapes = Element::new("MultiGeometry").child(point).children(
-        Some(view::ellipse90(incident, CORNERS))
-            .filter(|c| c.len() > 2)
-            .map(|c| polygon(&c)),
-    );
+    let rings = view::ellipse90(incident, CORNERS);
+    let shapes = Element::new("MultiGeometry")
+        .child(point)
+        .children(rings.iter().map(|ring| polygon(ring)));
     Element::new("Placemark")
         .with("id", super::cap::token(&incident.id))
         .field("name", view::callsign(incident))
@@ -142,9 +141,9 @@ fn data(incident: &Incident) -> Element {
     Element::new("ExtendedData").children(values.into_iter().map(value))
 }
 
-fn polygon(corners: &[[f64; 2]]) -> Element {
-    let closed = corners.iter().chain(corners.first());
-    let coordinates: Vec<String> = closed
+fn polygon(ring: &[[f64; 2]]) -> Element {
+    let coordinates: Vec<String> = ring
+        .iter()
         .map(|[lon, lat]| format!("{lon:.8},{lat:.8}"))
         .collect();
     let ring = Element::new("LinearRing").field("coordinates", coordinates.join(" "));

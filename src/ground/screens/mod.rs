@@ -16,6 +16,7 @@ mod foxglove;
 mod issuer;
 mod kml;
 mod metrics;
+mod rings;
 mod routes;
 mod tak;
 #[cfg(test)]

@@ -244,12 +244,15 @@ fn an_ellipse_at_the_date_line_and_an_aircraft_with_a_strange_name_make_sound_km
         .unwrap();
         alarm.properties.uav = "<b>&\u{7}".to_owned();
     });
-    assert_eq!(view::ellipse90(&far, 16).len(), 16);
-    assert!(
-        view::ellipse90(&far, 16)
-            .iter()
-            .all(|[lon, _]| (-180.0..=180.0).contains(lon))
-    );
+    let rings = view::ellipse90(&far, 16);
+    assert_eq!(rings.len(), 2, "one on each side of the line");
+    for ring in &rings {
+        assert_eq!(ring.first(), ring.last(), "closed");
+        let west = ring.iter().all(|[lon, _]| (-180.0..-179.0).contains(lon));
+        let east = ring.iter().all(|[lon, _]| (179.0..=180.0).contains(lon));
+        assert!(west || east, "{ring:?}");
+    }
     let text = kml::document(&[far], &[], "http://localhost", at(0));
+    assert_eq!(text.matches("<Polygon>").count(), 2, "{text}");
     assert!(!text.contains("<b>") && !text.contains('\u{7}'), "{text}");
 }

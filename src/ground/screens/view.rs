@@ -1,5 +1,6 @@
 //! The words that all screens share: what they say of one incident.
 
+use super::rings::rings;
 use crate::alarm::{AlarmClass, FireState};
 use crate::ground::incident::{Incident, OperatorState};
 use emberfix_frames::{
@@ -98,17 +99,22 @@ fn operator_words(incident: &Incident) -> String {
     }
 }
 
-/// Corners of the 90 % ellipse on the Earth, longitude and latitude, anticlockwise; empty where the
-/// covariance is none.
-pub(super) fn ellipse90(incident: &Incident, corners: u32) -> Vec<[f64; 2]> {
+/// The 90 % ellipse on the Earth as closed rings that cross neither the antimeridian nor a pole: longitude
+/// and latitude, anticlockwise; none where the covariance is none.
+pub(super) fn ellipse90(incident: &Incident, corners: u32) -> Vec<Vec<[f64; 2]>> {
     let Ok(covariance) = incident.covariance() else {
         return Vec::new();
     };
-    covariance
+    let corners: Vec<[f64; 2]> = covariance
         .ellipse90_m(corners)
         .into_iter()
         .filter_map(|(east_m, north_m)| offset(&incident.place, east_m, north_m))
-        .collect()
+        .collect();
+    let mut rings = rings(&corners);
+    for ring in &mut rings {
+        ring.extend(ring.first().copied());
+    }
+    rings
 }
 
 /// Longitude and latitude of a point in the tangent plane of `origin`.
