@@ -23,6 +23,7 @@ mod support;
 use clients::{Clients, Running};
 use live::Service;
 use serde_json::{Value, json};
+use sha2::{Digest as _, Sha256};
 use station::{Station, eventually, fire};
 use std::process::Command;
 use std::time::{SystemTime, UNIX_EPOCH};
@@ -123,6 +124,89 @@ fn an_alarm_appears_within_a_second_and_is_acknowledged_and_taken_back() {
         Some(&json!(1)),
         "the front is drawn"
     );
+}
+
+#[test]
+fn where_a_token_is_asked_for_the_page_asks_and_shows_what_the_token_allows() {
+    let Some(clients) = Clients::find() else {
+        return;
+    };
+    let access = |name: &str, role: &str| {
+        let digest = Sha256::digest(format!("token of {name}"));
+        format!("[[access]]\nname = \"{name}\"\nrole = \"{role}\"\ntoken_sha256 = \"{digest:x}\"\n")
+    };
+    let accesses = [
+        ("uav-1", "aircraft"),
+        ("wall", "screen"),
+        ("duty", "operator"),
+    ];
+    let station = Station::start(&accesses.map(|(name, role)| access(name, role)).concat());
+    let mut told = ureq::post(format!("{}/alarms", station.url));
+    told = told.header("authorization", "Bearer token of uav-1");
+    told.send_json(fire()).unwrap();
+
+    // Nobody yet: the page asks, and says so when the token is wrong.
+    let mut browser = self::browser(&clients, &station);
+    browser.args(["--scheme", "dark", "--phone", "--window", "390x844"]);
+    for step in [
+        "wait:Access token of this ground station",
+        "fill:#token=guessed",
+        "click:#enter",
+        "wait:The ground station does not know this token.",
+        "gone:uav-1-7",
+    ] {
+        browser.args(["--do", step]);
+    }
+    if seen(&Said::of(&browser.output().unwrap())).is_none() {
+        return;
+    }
+
+    // A screen looks; there is nothing to act with, and the keys do nothing.
+    let looking = [
+        "key:j",
+        "wait:31.409422, 119.112017",
+        "key:a",
+        "wait:This sign-in may look, not act.",
+    ];
+    let deeds = "document.querySelectorAll('.deeds, #me:not([hidden])').length";
+    let seen = signed_in(&clients, &station, "wall", &looking, deeds);
+    assert_eq!(seen, json!(0));
+
+    // An operator acts; the token is where no script and no address shows it.
+    let acting = [
+        "eval:localStorage.setItem('operator', 'Ana')",
+        "key:j",
+        "key:a",
+        "wait:Acknowledged by Ana (duty)",
+    ];
+    let hidden = "JSON.stringify([document.cookie, location.search, sessionStorage.length, localStorage.getItem('token')])";
+    let seen = signed_in(&clients, &station, "duty", &acting, hidden);
+    assert_eq!(seen, json!("[\"\",\"\",0,null]"));
+}
+
+/// Signs in, takes some steps, and gives the value of an expression.
+fn signed_in(
+    clients: &Clients,
+    station: &Station,
+    who: &str,
+    steps: &[&str],
+    value: &str,
+) -> Value {
+    let mut browser = browser(clients, station);
+    let token = format!("fill:#token=token of {who}");
+    let sign_in = [
+        "wait:Access token",
+        &token,
+        "click:#enter",
+        "wait:Live",
+        "wait:uav-1-7",
+    ];
+    for step in sign_in.iter().chain(steps) {
+        browser.args(["--do", step]);
+    }
+    browser.args(["--eval", value]);
+    let seen = seen(&Said::of(&browser.output().unwrap())).unwrap();
+    seen["values"][value].clone()
 }
 
 #[test]

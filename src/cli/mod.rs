@@ -115,7 +115,7 @@ pub fn main() -> ExitCode {
 fn usual_log(arguments: &Arguments) -> &'static str {
     match arguments.command {
         Command::Doctor(_) => "off",
-        _ => "info,ort=warn",
+        _ => "info,ort=warn,async_nats=warn",
     }
 }
 

@@ -1,7 +1,7 @@
 //! Who may do what: aircraft post, screens read, operators act.
 //!
-//! Callers show a token (`Authorization: Bearer TOKEN`; browsers and Google Earth: Basic, with any
-//! user name and the token as password) or a client certificate. The configuration holds SHA-256
+//! Callers show a token (`Authorization: Bearer TOKEN`; Google Earth and the like: Basic, with any user
+//! name and the token as password; the page: the cookie of [`super::session`]) or a client certificate. The configuration holds SHA-256
 //! digests of both, never a token. Without any `[[access]]` everyone on this machine may do everything;
 //! the configuration then allows a loopback address only.
 //!
@@ -10,6 +10,7 @@
 use super::http::refusal;
 use super::lock;
 use super::server::Peer;
+use super::session;
 use axum::extract::{Request, State};
 use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, header};
 use axum::middleware::Next;
@@ -30,7 +31,7 @@ const DEAF: Duration = Duration::from_secs(60);
 const MAX_ADDRESSES: usize = 4_096;
 
 /// What a caller is there for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Deserialize, serde::Serialize)]
 #[serde(rename_all = "snake_case")]
 pub(super) enum Role {
     /// Posts its own alarms, images and positions; fetches what operators did with them.
@@ -83,13 +84,16 @@ impl Caller {
 #[derive(Debug, Default)]
 pub(super) struct Doorkeeper {
     accesses: Vec<Arc<Access>>,
+    /// Whether the station is reached over TLS.
+    pub(super) tls: bool,
     failures: Mutex<HashMap<IpAddr, (u32, Instant)>>,
 }
 
 impl Doorkeeper {
-    pub fn new(accesses: Vec<Access>) -> Self {
+    pub fn new(accesses: Vec<Access>, tls: bool) -> Self {
         Self {
             accesses: accesses.into_iter().map(Arc::new).collect(),
+            tls,
             failures: Mutex::default(),
         }
     }
@@ -107,9 +111,21 @@ impl Doorkeeper {
         if let Some(access) = by_certificate {
             return Ok(Caller::Known(access));
         }
-        let Some(token) = token(headers) else {
-            return Err(Refused::Nobody);
-        };
+        let by_cookie = || session::shown(headers, self.tls);
+        match token(headers).or_else(by_cookie) {
+            Some(token) => self.recognise_token(peer, &token),
+            None => Err(Refused::Nobody),
+        }
+    }
+
+    /// Whose token it is.
+    pub(super) fn recognise_token(&self, peer: &Peer, token: &[u8]) -> Result<Caller, Refused> {
+        if self.accesses.is_empty() {
+            return Ok(Caller::Anyone);
+        }
+        if self.is_deaf_to(peer.address) {
+            return Err(Refused::Deaf);
+        }
         match self.find(Sha256::digest(token).into(), |access| access.token) {
             Some(access) => Ok(Caller::Known(access)),
             None => {
@@ -176,7 +192,7 @@ fn token(headers: &HeaderMap) -> Option<Vec<u8>> {
 
 /// Why somebody is not let in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Refused {
+pub(super) enum Refused {
     Nobody,
     Deaf,
     Role,
@@ -184,7 +200,7 @@ enum Refused {
 }
 
 impl Refused {
-    fn answer(self) -> Response {
+    pub(super) fn answer(self, to: &HeaderMap) -> Response {
         let (status, reason) = match self {
             Self::Nobody => (
                 StatusCode::UNAUTHORIZED,
@@ -199,11 +215,28 @@ impl Refused {
         };
         let mut answer = refusal(status, reason);
         if self == Self::Nobody {
-            let ask = HeaderValue::from_static("Basic realm=\"emberfix\", charset=\"UTF-8\"");
+            let ask = HeaderValue::from_static(challenge(to));
             answer.headers_mut().insert(header::WWW_AUTHENTICATE, ask);
         }
         answer
     }
+}
+
+/// What a refused caller is asked for. Our page asks for a token itself: for a request that a page's script
+/// makes (the browser says so), `Basic` would open the browser's own window over it.
+fn challenge(to: &HeaderMap) -> &'static str {
+    match to.get("sec-fetch-mode") {
+        Some(mode) if mode != "navigate" => "Bearer realm=\"emberfix\"",
+        _ => "Basic realm=\"emberfix\", charset=\"UTF-8\"",
+    }
+}
+
+/// What everyone gets: the page's own files, which hold no word of any fire, and the way to sign in.
+fn is_open(method: &Method, path: &str) -> bool {
+    let reads = *method == Method::GET || *method == Method::HEAD;
+    let of_page = path == "/" || path.starts_with("/page/") || path.starts_with("/icons/");
+    let signs = *method == Method::POST || *method == Method::DELETE;
+    reads && of_page || signs && path == "/session"
 }
 
 /// Lets a request in, or not.
@@ -217,7 +250,7 @@ pub(super) async fn admit(
             request.extensions_mut().insert(caller);
             next.run(request).await
         }
-        Err(refused) => refused.answer().into_response(),
+        Err(refused) => refused.answer(request.headers()).into_response(),
     }
 }
 
@@ -231,6 +264,9 @@ fn examine(keeper: &Doorkeeper, request: &Request) -> Result<Caller, Refused> {
     let reads = *method == Method::GET || *method == Method::HEAD;
     if !reads && is_cross_site(request.headers()) {
         return Err(Refused::CrossSite);
+    }
+    if is_open(method, path) {
+        return Ok(Caller::Anyone);
     }
     let caller = keeper.recognise(peer, request.headers())?;
     match &caller {
@@ -280,12 +316,30 @@ mod tests {
             (true, "/health", [true, true, true]),
             (true, "/alarms.geojson", [false, true, true]),
             (true, "/events", [false, true, true]),
-            (true, "/", [false, true, true]),
+            (true, "/session", [false, true, true]),
             (false, "/incidents/a-1/actions", [false, false, true]),
         ];
         for (reads, path, allowed) in cases {
             let found = [Aircraft, Screen, Operator].map(|role| may(role, reads, path));
             assert_eq!(found, allowed, "{path}");
+        }
+    }
+
+    #[test]
+    fn only_the_pages_own_files_and_the_way_to_sign_in_are_open() {
+        let open = ["/", "/page/main.js", "/icons/fire.png"];
+        assert!(open.iter().all(|path| is_open(&Method::GET, path)));
+        assert!(is_open(&Method::POST, "/session"));
+        for (method, path) in [
+            (Method::GET, "/session"),
+            (Method::GET, "/events"),
+            (Method::GET, "/incidents.geojson"),
+            (Method::GET, "/pages"),
+            (Method::POST, "/"),
+            (Method::POST, "/page/main.js"),
+            (Method::POST, "/alarms"),
+        ] {
+            assert!(!is_open(&method, path), "{method} {path}");
         }
     }
 

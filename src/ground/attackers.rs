@@ -1,8 +1,11 @@
 //! An attacker's list: each is refused, counted and harmless. The core goes on: alarms are taken while
-//! it lasts, and everything stands as before when it is over.
+//! it lasts, and everything stands as before when it is over. [`super::faults`] holds the whole list.
 
 use super::store::tests::feature;
-use super::{Ground, GroundConfig, Overrides};
+use super::{Ground, GroundConfig, Overrides, lock};
+use crate::deliver::datagram::wire::{Beat, ToGround};
+use crate::deliver::envelope::Origin;
+use crate::deliver::http::WIRE_KIND;
 use rcgen::{BasicConstraints, CertificateParams, CertifiedIssuer, IsCa, KeyPair};
 use sha2::{Digest, Sha256};
 use std::net::SocketAddr;
@@ -237,6 +240,7 @@ async fn bodies_paths_headers_and_foreign_pages_are_refused_and_counted() {
         health["turned_away"]["malformed"].as_u64() > Some(0),
         "{health}"
     );
+    assert_eq!(health["turned_away"]["large"], 2, "heads: {health}");
     assert_eq!(
         (&health["alarms"], &health["incidents"]),
         (&1.into(), &1.into())
@@ -249,7 +253,7 @@ async fn who_dawdles_is_shown_out_and_a_crowd_is_told_so() {
     let folder = tempfile::tempdir().unwrap();
     let ground = start(folder.path(), NARROW).await;
     let address = ground.address();
-    // A head that comes in at one byte each 100 ms, and one that never reads its stream.
+    // A head that comes in at one byte each 100 ms.
     let mut slow = TcpStream::connect(address).await.unwrap();
     let begun = Instant::now();
     let mut sent = 0;
@@ -264,15 +268,6 @@ async fn who_dawdles_is_shown_out_and_a_crowd_is_told_so() {
         (1..60).contains(&sent),
         "a slow head was heard for {sent} bytes"
     );
-    let mut deaf = Vec::new();
-    for _ in 0..4 {
-        let mut stream = TcpStream::connect(address).await.unwrap();
-        stream
-            .write_all(b"GET /events HTTP/1.1\r\nhost: localhost\r\n\r\n")
-            .await
-            .unwrap();
-        deaf.push(stream);
-    }
     works(address, 1).await;
     // A crowd: more than may be inside. Those beyond are told so, and nobody who is inside minds.
     let mut crowd = Vec::new();
@@ -297,7 +292,67 @@ async fn who_dawdles_is_shown_out_and_a_crowd_is_told_so() {
         health["turned_away"]["slow"].as_u64() >= Some(1),
         "{health}"
     );
+    ground.stop().await.unwrap();
+}
+
+#[tokio::test]
+async fn who_never_reads_his_stream_is_shown_out_and_costs_nobody_else() {
+    let folder = tempfile::tempdir().unwrap();
+    let ground = start(folder.path(), NARROW).await;
+    let address = ground.address();
+    // More than the system keeps for a connection that nobody reads.
+    let padding = "x".repeat(60_000);
+    for fire in 0..100 {
+        let alarm = feature(&format!("gaochun-{fire}"), 1, "2026-03-01T12:00:01Z");
+        let alarm = alarm.replacen("\"id\"", &format!("\"padding\":\"{padding}\",\"id\""), 1);
+        assert_eq!(post(address, "", &alarm).await.0, 201);
+    }
+    let mut deaf = Vec::new();
+    for _ in 0..4 {
+        let socket = tokio::net::TcpSocket::new_v4().unwrap();
+        socket.set_recv_buffer_size(4_096).unwrap();
+        let mut stream = socket.connect(address).await.unwrap();
+        let ask = b"GET /events HTTP/1.1\r\nhost: localhost\r\n\r\n";
+        stream.write_all(ask).await.unwrap();
+        deaf.push(stream);
+    }
+    let begun = Instant::now();
+    loop {
+        let health = health(address).await;
+        if health["turned_away"]["slow"].as_u64() >= Some(4) && health["streams"] == 0 {
+            break;
+        }
+        assert!(begun.elapsed() < PATIENCE, "{health}");
+        tokio::time::sleep(Duration::from_millis(100)).await;
+    }
+    works(address, 1_000).await;
     drop(deaf);
+    ground.stop().await.unwrap();
+}
+
+#[tokio::test]
+async fn a_clock_that_is_a_day_off_changes_neither_what_is_kept_nor_its_order() {
+    let folder = tempfile::tempdir().unwrap();
+    let ground = start(folder.path(), "").await;
+    let now = super::now();
+    for (fire, hours) in [(1, 24), (2, -24)] {
+        let captured_at = now + emberfix_frames::SignedDuration::from_hours(hours);
+        let captured_at = captured_at.rfc3339();
+        let first = format!("\"first_seen_at\":\"{captured_at}\"");
+        let told = |revision| {
+            feature(&format!("gaochun-{fire}"), revision, &captured_at)
+                .replace("\"first_seen_at\":\"2026-03-01T12:00:00Z\"", &first)
+        };
+        for (revision, status) in [(2, 201), (1, 201), (2, 200)] {
+            let (answered, text) = post(ground.address(), "", &told(revision)).await;
+            assert_eq!(answered, status, "{text}");
+        }
+        // The greater revision stands, whatever any clock says of it.
+        let incident = ground.station.incident(&format!("gaochun-{fire}"));
+        let incident = incident.unwrap();
+        assert_eq!(incident.alarms[0].revision, 2);
+        assert_eq!(incident.captured_at.rfc3339(), captured_at);
+    }
     ground.stop().await.unwrap();
 }
 
@@ -340,7 +395,12 @@ async fn tokens_let_each_role_do_its_own_and_guessing_is_cut_short() {
     assert_eq!(post(address, "", &mine).await.0, 401);
     assert_eq!(post(address, &bearer("wall"), &mine).await.0, 403);
     assert_eq!(post(address, &bearer("gaochun"), &theirs).await.0, 403);
+    let of_another = mine.replace("\"gaochun-1\"", "\"another-1\"");
+    assert_eq!(post(address, &bearer("gaochun"), &of_another).await.0, 403);
     assert_eq!(post(address, &bearer("gaochun"), &mine).await.0, 201);
+    for (uav, status) in [("another", 403), ("gaochun", 200)] {
+        assert_eq!(beat(address, uav).await, status, "over /wire as {uav}");
+    }
     let seen = [("gaochun", 403), ("wall", 200), ("duty", 200)];
     for (who, status) in seen {
         assert_eq!(get("/incidents.geojson", who).await, status, "{who}");
@@ -377,6 +437,92 @@ async fn tokens_let_each_role_do_its_own_and_guessing_is_cut_short() {
         assert_eq!(get("/health", "nobody").await, 401);
     }
     assert_eq!(get("/health", "nobody").await, 429);
+    let refused = lock(&ground.station.refusals).clone();
+    for (status, least) in [(401, 11), (403, 8), (429, 1)] {
+        assert!(refused[&status] >= least, "{status}: {refused:?}");
+    }
+    ground.stop().await.unwrap();
+}
+
+/// A beat of an aircraft over `/wire`, with the token of gaochun; the status.
+async fn beat(address: SocketAddr, uav: &str) -> u16 {
+    let beat = ToGround::Beat(Beat {
+        origin: Origin {
+            uav: uav.to_owned(),
+            outbox: 7,
+        },
+        newest: 0,
+        waiting: 0,
+        actions_known: 0,
+        stamp: 1,
+        ping: Vec::new(),
+    });
+    let body = beat.datagram(None);
+    let head = format!(
+        "POST /wire HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\n{}\
+         content-type: {WIRE_KIND}\r\ncontent-length: {}\r\n\r\n",
+        bearer("gaochun"),
+        body.len()
+    );
+    say(address, &[head.as_bytes(), &body].concat()).await.0
+}
+
+#[tokio::test]
+async fn a_browser_signs_in_once_and_nobody_can_do_it_in_its_name() {
+    let folder = tempfile::tempdir().unwrap();
+    let ground = start(folder.path(), &accesses()).await;
+    let address = ground.address();
+    let kind = "content-type: application/json\r\n";
+    let sign_in = async |token: &str, headers: &str| {
+        let body = serde_json::json!({ "token": token }).to_string();
+        let headers = format!("{kind}{headers}");
+        say(
+            address,
+            request("POST", "/session", &headers, &body).as_bytes(),
+        )
+        .await
+    };
+    // The page itself is no secret; what it asks for is, and no window of the browser's comes up.
+    let get = async |path: &str, headers: &str| {
+        say(address, request("GET", path, headers, "").as_bytes()).await
+    };
+    for open in ["/", "/page/main.js", "/icons/fire.png"] {
+        assert_eq!(get(open, "").await.0, 200, "{open}");
+    }
+    let (status, answer) = get("/events", "sec-fetch-mode: cors\r\n").await;
+    assert_eq!(status, 401);
+    assert!(!answer.contains("Basic"), "{answer}");
+    assert!(get("/incidents.geojson", "").await.1.contains("Basic"));
+
+    let foreign = "origin: https://evil.example\r\nsec-fetch-site: cross-site\r\n";
+    let token = "token of duty";
+    for (token, headers, status) in [
+        ("token of nobody", "", 401),
+        ("token of gaochun", "", 403),
+        (token, foreign, 403),
+        ("", "", 400),
+    ] {
+        let (answered, answer) = sign_in(token, headers).await;
+        assert_eq!(answered, status, "{token:?} {headers:?}: {answer}");
+        assert!(!answer.contains("set-cookie"), "{answer}");
+    }
+    let (status, answer) = sign_in(token, "").await;
+    assert_eq!(status, 200, "{answer}");
+    assert!(!answer.contains(token), "{answer}");
+    let line = answer.lines().find_map(|l| l.strip_prefix("set-cookie: "));
+    let cookie = line.unwrap().split(';').next().unwrap();
+    let cookie = format!("cookie: {cookie}\r\n");
+    let (status, answer) = get("/session", &cookie).await;
+    assert!(status == 200 && answer.contains("\"operator\""), "{answer}");
+    assert_eq!(get("/incidents.geojson", &cookie).await.0, 200);
+    // Another site's page makes the browser act with its cookie, if it should send it at all.
+    let order = "{\"kind\":\"acknowledge\",\"by\":\"Li\"}";
+    let headers = format!("{kind}{cookie}{foreign}");
+    let order = request("POST", "/incidents/gaochun-1/actions", &headers, order);
+    assert_eq!(say(address, order.as_bytes()).await.0, 403);
+    let end = request("DELETE", "/session", &cookie, "");
+    let (_, answer) = say(address, end.as_bytes()).await;
+    assert!(answer.contains("Max-Age=0"), "{answer}");
     ground.stop().await.unwrap();
 }
 
@@ -395,9 +541,17 @@ fn papers(folder: &Path) -> Papers {
     let write = |name: &str, text: String| std::fs::write(folder.join(name), text).unwrap();
     write("ca.pem", ours.pem());
     let mut client = [0; 32];
-    for (name, issuer) in [("server", &ours), ("client", &ours), ("stranger", &strange)] {
+    for (name, issuer) in [
+        ("server", &ours),
+        ("client", &ours),
+        ("expired", &ours),
+        ("stranger", &strange),
+    ] {
         let key = KeyPair::generate().unwrap();
-        let params = CertificateParams::new(vec!["localhost".to_owned()]).unwrap();
+        let mut params = CertificateParams::new(vec!["localhost".to_owned()]).unwrap();
+        if name == "expired" {
+            params.not_after = rcgen::date_time_ymd(2020, 1, 1);
+        }
         let certificate = params.signed_by(&key, issuer).unwrap();
         write(&format!("{name}.pem"), certificate.pem());
         write(&format!("{name}.key"), key.serialize_pem());
@@ -446,6 +600,16 @@ async fn over_tls_certificates_count_and_old_versions_and_strangers_are_refused(
     );
     let ground = start(folder.path(), &more).await;
     let address = ground.address();
+    let kml = async |headers: &str| {
+        let stream = TcpStream::connect(address).await.unwrap();
+        let name = ServerName::try_from("localhost").unwrap();
+        let connecting = connector(folder.path(), Some("client"), false).connect(name, stream);
+        let ask = request("GET", "/emberfix.kml", headers, "");
+        say_on(connecting.await.unwrap(), ask.as_bytes()).await.1
+    };
+    let links = kml("").await;
+    let link = "<href>https://localhost/incidents.kml</href>";
+    assert!(links.contains(link), "{links}");
     let ask = async |show: Option<&str>, old: bool, headers: &str| {
         let stream = TcpStream::connect(address).await.unwrap();
         let name = ServerName::try_from("localhost").unwrap();
@@ -465,6 +629,7 @@ async fn over_tls_certificates_count_and_old_versions_and_strangers_are_refused(
     assert_eq!(ask(None, false, "").await, 401);
     assert_eq!(ask(None, false, &bearer("wall")).await, 200);
     assert_eq!(ask(Some("stranger"), false, &bearer("wall")).await, 0);
+    assert_eq!(ask(Some("expired"), false, &bearer("wall")).await, 0);
     assert_eq!(ask(None, true, &bearer("wall")).await, 0, "TLS 1.2");
     assert_eq!(
         say(
@@ -480,6 +645,6 @@ async fn over_tls_certificates_count_and_old_versions_and_strangers_are_refused(
         .turned
         .tls
         .load(std::sync::atomic::Ordering::Relaxed);
-    assert!(turned >= 3, "{turned}");
+    assert!(turned >= 4, "{turned}");
     ground.stop().await.unwrap();
 }

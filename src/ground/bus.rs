@@ -3,13 +3,15 @@
 //! **Out.** Every alarm that came in by another way is published to `<prefix>.alarm.<aircraft>` with
 //! `Nats-Msg-Id` = alarm id, revision and completeness, so that the stream takes it once. The station's
 //! own disk has it before, and a cursor says up to which row the bus has confirmed it.
-//! **In.** A durable consumer per station; a message is acknowledged (and the acknowledgement
-//! confirmed) only when this station's disk has the alarm. What comes twice changes nothing.
+//! **In.** A durable consumer per station; a message is acknowledged only when this station's disk has
+//! the alarm. What comes twice, because the acknowledgement was lost too, changes nothing.
 //!
-//! **Trust.** JetStream confirms before it syncs unless it is told to (`sync_interval: always`), and
-//! has lost confirmed messages in power cuts. So the cursor remembers the sequence number that was
-//! confirmed: a stream that ends before it, or that was made anew, is told everything again from the
-//! row where it is known to be whole. De-duplication makes that harmless.
+//! **Trust.** JetStream confirms before it syncs, unless it is told to sync at each message
+//! (`sync_interval: always`, some hundred messages a second), and a power cut takes what it had not
+//! synced. So the cursor remembers the last message that was confirmed, by its number and its id, and
+//! before it is moved on the stream is asked whether that message still stands there: a stream that has
+//! lost its end, or was made anew, has not, even if others have filled it up meanwhile. It is then told
+//! everything again. De-duplication makes that harmless.
 //!
 //! **Known limits.** Operators' actions stay at the station where they were taken. Alarms only; images
 //! go with the aircraft's own link.
@@ -19,9 +21,10 @@ use super::{ReceiveError, Station};
 use async_nats::jetstream::consumer::{AckPolicy, DeliverPolicy, pull};
 use async_nats::jetstream::context::PublishAckFuture;
 use async_nats::jetstream::message::PublishMessage;
-use async_nats::jetstream::stream::{self, DiscardPolicy, StorageType};
+use async_nats::jetstream::stream::{self, DiscardPolicy, RawMessageErrorKind, StorageType};
 use async_nats::jetstream::{self, AckKind, Message};
 use serde::Serialize;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
@@ -56,7 +59,7 @@ pub(super) struct BusConfig {
     /// Domain of the JetStream that has it; a leaf node reaches it by that name only.
     pub domain: Option<String>,
     pub replicas: usize,
-    pub credentials: Option<std::path::PathBuf>,
+    pub credentials: Option<PathBuf>,
 }
 
 /// How the bus fares, for `/health`.
@@ -76,6 +79,13 @@ pub(super) struct BusHealth {
     failures: AtomicU64,
 }
 
+#[cfg(test)]
+impl BusHealth {
+    pub(super) fn published(&self) -> u64 {
+        self.published.load(Ordering::Relaxed)
+    }
+}
+
 /// Why the bus does not go on for the moment.
 #[derive(Debug, thiserror::Error)]
 enum BusError {
@@ -93,6 +103,21 @@ fn nats<E: Into<async_nats::Error>>(doing: &'static str) -> impl FnOnce(E) -> Bu
         doing,
         source: source.into(),
     }
+}
+
+/// The program of the bus's server, for tests and measurements: from the environment, beside the test clients' Python, or from the PATH.
+#[must_use]
+pub fn nats_server() -> Option<PathBuf> {
+    let named = std::env::var_os("EMBERFIX_NATS_SERVER").map(PathBuf::from);
+    let beside = std::env::var_os("EMBERFIX_PYTHON")
+        .map(|python| Path::new(&python).with_file_name("nats-server"));
+    let path = std::env::var_os("PATH").unwrap_or_default();
+    let on_path = std::env::split_paths(&path).map(|folder| folder.join("nats-server"));
+    named
+        .into_iter()
+        .chain(beside)
+        .chain(on_path)
+        .find(|program| program.is_file())
 }
 
 /// Talks to the bus until the station stops; a bus that is not there is tried again and again.
@@ -179,7 +204,8 @@ async fn open(
 
 async fn publish(station: &Arc<Station>, config: &BusConfig) -> Result<(), BusError> {
     let context = connect(config).await?;
-    let mut cursor = resume(station, &open(config, &context).await?).await?;
+    let stream = open(config, &context).await?;
+    let mut cursor = resume(station, &stream).await?;
     let mut rows = station.rows();
     loop {
         rows.mark_unchanged();
@@ -194,7 +220,13 @@ async fn publish(station: &Arc<Station>, config: &BusConfig) -> Result<(), BusEr
             }
             continue;
         }
-        confirm(station, config, &context, &page, &mut cursor).await?;
+        let mut next = cursor.clone();
+        confirm(station, config, &context, &page, &mut next).await?;
+        if !still_has(&stream, &cursor).await? {
+            cursor = resume(station, &open(config, &context).await?).await?;
+            continue;
+        }
+        cursor = next;
         station.writer.bus(cursor.clone()).await?;
     }
 }
@@ -208,7 +240,7 @@ async fn resume(station: &Arc<Station>, stream: &stream::Stream) -> Result<BusCu
     let made = info.created.unix_timestamp_nanos();
     let name = format!("{} of {made}", info.config.name);
     let cursor = station.with_store(|store| store.bus_cursor()).await?;
-    if cursor.stream == name && info.state.last_sequence >= cursor.sequence {
+    if cursor.stream == name && still_has(stream, &cursor).await? {
         return Ok(cursor);
     }
     if cursor.row > 0 {
@@ -220,10 +252,29 @@ async fn resume(station: &Arc<Station>, stream: &stream::Stream) -> Result<BusCu
         station.bus.told_again.fetch_add(1, Ordering::Relaxed);
     }
     Ok(BusCursor {
-        row: 0,
-        sequence: 0,
         stream: name,
+        ..BusCursor::default()
     })
+}
+
+/// Whether the last message that was confirmed stands where it stood.
+async fn still_has(stream: &stream::Stream, cursor: &BusCursor) -> Result<bool, BusError> {
+    if cursor.row == 0 {
+        return Ok(true);
+    }
+    match stream.get_raw_message(cursor.sequence).await {
+        Ok(found) => {
+            let id = found.headers.get(async_nats::header::NATS_MESSAGE_ID);
+            Ok(id.is_some_and(|id| id.as_str() == cursor.message))
+        }
+        Err(error) if error.kind() == RawMessageErrorKind::NoMessageFound => {
+            // At its beginning a stream may forget, if an operator has limited it; never at its end.
+            let info = stream.get_info().await;
+            let first = info.map_err(nats("asks for its stream"))?.state;
+            Ok(cursor.sequence < first.first_sequence && first.messages > 0)
+        }
+        Err(error) => Err(nats("asks for a message")(error)),
+    }
 }
 
 /// Publishes a page and waits until all of it is confirmed.
@@ -234,15 +285,11 @@ async fn confirm(
     page: &[BusRow],
     cursor: &mut BusCursor,
 ) -> Result<(), BusError> {
-    let mut waiting: Vec<(i64, PublishAckFuture)> = Vec::new();
+    let mut waiting: Vec<(i64, String, PublishAckFuture)> = Vec::new();
     for row in page {
+        let id = format!("{}/{}/{}", row.id, row.revision, word(row.completeness));
         let message = PublishMessage::build()
-            .message_id(format!(
-                "{}/{}/{}",
-                row.id,
-                row.revision,
-                word(row.completeness)
-            ))
+            .message_id(&id)
             .header(COMPLETENESS, word(row.completeness))
             .payload(row.feature.clone().into());
         let subject = format!("{}.alarm.{}", config.stream.to_lowercase(), token(&row.uav));
@@ -250,12 +297,14 @@ async fn confirm(
             .send_publish(subject, message)
             .await
             .map_err(nats("publishes"))?;
-        waiting.push((row.row, sent));
+        waiting.push((row.row, id, sent));
     }
-    for (row, sent) in waiting {
+    for (row, id, sent) in waiting {
         let ack = sent.await.map_err(nats("waits for a confirmation"))?;
         cursor.row = row;
-        cursor.sequence = cursor.sequence.max(ack.sequence);
+        if ack.sequence > cursor.sequence {
+            (cursor.sequence, cursor.message) = (ack.sequence, id);
+        }
         let counter = if ack.duplicate {
             &station.bus.repeated
         } else {

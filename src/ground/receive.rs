@@ -279,6 +279,18 @@ impl Reception {
         }
     }
 
+    /// Which aircraft a datagram says it comes from; none when it can't be read.
+    pub fn speaker(datagram: &[u8]) -> Option<String> {
+        let (said, _) = ToGround::read(datagram).ok()?;
+        let origin = match said {
+            ToGround::Letter { sealed, .. } => sealed.envelope.origin,
+            ToGround::Beat(beat) => beat.origin,
+            ToGround::Ask(ask) => ask.origin,
+            ToGround::Chip(part) => part.origin,
+        };
+        Some(origin.uav)
+    }
+
     /// Greatest action that an aircraft said it took.
     pub fn actions_known(&self, uav: &str) -> u64 {
         let accounts = self.ledger.accounts();

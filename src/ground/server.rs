@@ -74,8 +74,10 @@ pub(super) struct Turned {
     pub tls: AtomicU64,
     /// The head did not come in time, or nothing moved any more.
     pub slow: AtomicU64,
-    /// No HTTP, or a head that is too large.
+    /// No HTTP.
     pub malformed: AtomicU64,
+    /// A head that is too large (431).
+    pub large: AtomicU64,
 }
 
 /// Who is on the other end, as far as the connection says.
@@ -257,6 +259,8 @@ impl Turned {
     fn count(&self, error: &hyper::Error) {
         let counter = if error.is_timeout() || is_still(error) {
             &self.slow
+        } else if error.is_parse_too_large() {
+            &self.large
         } else if error.is_parse() {
             &self.malformed
         } else {

@@ -24,6 +24,7 @@ mod proxy;
 pub mod quic;
 mod slaughter;
 
+use crate::eval::ground::{self, LoadError};
 use crate::eval::{Report, Table};
 use emberfix_report::{Bound, Figure};
 use serde::Serialize;
@@ -49,7 +50,7 @@ impl Options {
             Part::Kills if self.quick => slaughter::KILLS.1,
             Part::Kills => slaughter::KILLS.0,
             Part::Disk => 3,
-            Part::Load => 1,
+            Part::Load | Part::Nats => 1,
         };
         self.parts.iter().map(steps).sum::<usize>() as u64
     }
@@ -66,11 +67,19 @@ pub enum Part {
     Disk,
     /// Alarms a second that one ground process keeps.
     Load,
+    /// The same through NATS JetStream, whose server is killed in between.
+    Nats,
 }
 
 impl Part {
     /// All of them.
-    pub const ALL: [Self; 4] = [Self::Latency, Self::Kills, Self::Disk, Self::Load];
+    pub const ALL: [Self; 5] = [
+        Self::Latency,
+        Self::Kills,
+        Self::Disk,
+        Self::Load,
+        Self::Nats,
+    ];
 }
 
 /// Why nothing could be measured.
@@ -104,7 +113,7 @@ pub enum DeliveryError {
     },
     /// The load on the ground could not be made.
     #[error(transparent)]
-    Load(#[from] crate::eval::ground::LoadError),
+    Load(#[from] LoadError),
     /// The outbox failed where it should not.
     #[error(transparent)]
     Outbox(#[from] crate::deliver::OutboxError),
@@ -164,6 +173,10 @@ pub type Told<'a> = &'a (dyn Fn(&str) + Sync);
 /// # Errors
 /// [`DeliveryError`] when a child can't be run.
 pub fn measure(options: &Options, told: Told<'_>) -> Result<Report, DeliveryError> {
+    if options.parts.contains(&Part::Nats) && crate::ground::nats_server().is_none() {
+        // Said before hours have gone, not after.
+        return Err(LoadError::NoServer.into());
+    }
     let scratch = Scratch::new()?;
     let mut found = Found::default();
     for part in &options.parts {
@@ -171,7 +184,8 @@ pub fn measure(options: &Options, told: Told<'_>) -> Result<Report, DeliveryErro
             Part::Latency => latency::measure(options, scratch.path(), told)?,
             Part::Kills => slaughter::measure(options, scratch.path(), told)?,
             Part::Disk => disk::measure(options, scratch.path(), told)?,
-            Part::Load => load(options, told)?,
+            Part::Load => loaded("load", told, || ground::measure(options.quick))?,
+            Part::Nats => loaded("nats", told, || ground::nats::measure(options.quick))?,
         };
         found.audit = found.audit.plus(more.audit);
         found.figures.extend(more.figures);
@@ -181,12 +195,16 @@ pub fn measure(options: &Options, told: Told<'_>) -> Result<Report, DeliveryErro
     Ok(report(options, found))
 }
 
-/// [`crate::eval::ground`] as a part of this.
-fn load(options: &Options, told: Told<'_>) -> Result<Found, DeliveryError> {
-    told("load");
-    let report = crate::eval::ground::measure(options.quick)?;
+/// A measurement of [`ground`] as a part of this.
+fn loaded(
+    name: &str,
+    told: Told<'_>,
+    measure: impl FnOnce() -> Result<Report, LoadError>,
+) -> Result<Found, DeliveryError> {
+    told(name);
+    let report = measure()?;
     let mut details = serde_json::Map::new();
-    details.insert("ground".to_owned(), report.details);
+    details.insert(name.to_owned(), report.details);
     Ok(Found {
         figures: report.figures,
         tables: report.tables,

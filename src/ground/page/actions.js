@@ -3,6 +3,7 @@
 
 import { $, html } from "./dom.js";
 import { chosen, known, takeIncident } from "./state.js";
+import { mayAct } from "./session.js";
 import { name } from "./words.js";
 
 let refresh = () => {};
@@ -51,6 +52,7 @@ const uuid = () => crypto.randomUUID?.() ?? `${Date.now().toString(36)}-${Math.r
 
 /** Sends one deed, and tells what became of it. */
 async function send(id, kind, words, extra = {}) {
+  if (!mayAct()) { toast("This sign-in may look, not act.", false, true); return; }
   const by = await whoActs();
   if (!by) return;
   try {
@@ -69,7 +71,7 @@ export function act(kind, with_ = null) {
   if (!feature) return;
   const what = name(feature.properties);
   const words = { acknowledge: `${what} acknowledged`, confirm: `${what} confirmed`, dismiss: `${what} dismissed`, split: `${with_} is a fire of its own` }[kind];
-  if (kind === "merge") beginMerge(feature.id);
+  if (kind === "merge" && mayAct()) beginMerge(feature.id);
   else send(feature.id, kind, words, with_ ? { with: with_ } : {});
 }
 

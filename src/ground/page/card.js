@@ -1,6 +1,7 @@
 // What the chosen incident shows beside its heading.
 
 import { html, svg } from "./dom.js";
+import { mayAct } from "./session.js";
 import { isDismissed, known, newestAlarm } from "./state.js";
 import {
   adviceText, areaText, basis, clock, doubtText, heights, historyText, metres, places, seenBy, sizeText, spreadText, trendText,
@@ -23,6 +24,7 @@ function picture(feature) {
 }
 
 function deeds(p) {
+  if (!mayAct()) return null;
   const { state } = p.operator;
   const all = isDismissed(p)
     ? [button("confirm", "It is a fire", { class: "strong" })]
@@ -89,7 +91,7 @@ function doubts(p) {
 function members(p) {
   if (p.alarms.length < 2) return null;
   const rows = p.alarms.map((alarm) => html("li", {}, html("span", {}, `${alarm.alarm} by ${alarm.uav}, ±${metres(alarm.ce90_m)}`),
-    button("split", "Not this fire", { "data-with": alarm.alarm, "aria-label": `Not this fire: ${alarm.alarm}` })));
+    mayAct() ? button("split", "Not this fire", { "data-with": alarm.alarm, "aria-label": `Not this fire: ${alarm.alarm}` }) : null));
   return html("div", { class: "members" }, html("h4", {}, "Put together from"), html("ul", {}, ...rows));
 }
 

@@ -2,11 +2,13 @@
 
 import { $ } from "./dom.js";
 import { SILENT_MS, forgetAll, known, takeGone, takeIncident, takePosition, takeTracks } from "./state.js";
+import { enter, isAsking } from "./session.js";
 import { age, clock } from "./words.js";
 import { heed } from "./alert.js";
 import { forgetPlane } from "./map.js";
 
-let refresh = () => {};
+const RETRY_MS = 2000;
+let refresh = () => {}, entered = () => {};
 let stream = null, lastId = null, retry = 0, triedAt = 0;
 let isFresh = false; // what came since the stream caught up is news, before it is how things stand
 
@@ -45,11 +47,30 @@ function heard() {
 export function tick() {
   tellLost();
   const quiet = Date.now() - Math.max(known.heardAt, triedAt);
-  if (quiet > SILENT_MS) { lose(); connect(); }
+  if (quiet > SILENT_MS && !isAsking()) { lose(); connect(); }
 }
 
-export function connect(redraw = refresh) {
-  refresh = redraw;
+/** Opens the line when the station lets us in; `inside` is called whenever it has. */
+export function begin(redraw, inside) {
+  [refresh, entered] = [redraw, inside];
+  open();
+}
+
+async function open() {
+  clearTimeout(retry);
+  triedAt = Date.now();
+  try {
+    await enter();
+  } catch {
+    lose();
+    retry = setTimeout(open, RETRY_MS);
+    return;
+  }
+  connect();
+  entered();
+}
+
+function connect() {
   stream?.close();
   clearTimeout(retry);
   triedAt = Date.now();
@@ -73,8 +94,8 @@ export function connect(redraw = refresh) {
   on("refused", ({ at, link, reason }) => banner("refused", `${clock(at)}: a report over ${link} was not taken. ${reason}`));
   stream.onerror = () => {
     lose();
-    // The browser itself tries again after a broken line, but not after a refusal.
-    if (stream.readyState === EventSource.CLOSED) retry = setTimeout(connect, 3000);
+    // The browser itself tries again after a broken line, but not after a refusal: perhaps we are not let in any more.
+    if (stream.readyState === EventSource.CLOSED) retry = setTimeout(open, RETRY_MS);
   };
 }
 

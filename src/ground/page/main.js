@@ -7,6 +7,7 @@ import * as keys from "./keys.js";
 import * as link from "./link.js";
 import { choose as open, craftList, entryOf, list, summary } from "./list.js";
 import * as map from "./map.js";
+import * as session from "./session.js";
 import { chosen, isOpen, known, now, sorted } from "./state.js";
 import * as theme from "./theme.js";
 import { load as loadTiles } from "./tiles.js";
@@ -113,5 +114,6 @@ alert.listen();
 theme.listen();
 setInterval(tick, 1000);
 tick();
-loadTiles().then(refresh).catch(() => {});
-link.connect(refresh);
+session.listen();
+// Where a token is asked for, everything else waits for it.
+link.begin(refresh, () => loadTiles().then(refresh).catch(() => {}));

@@ -10,6 +10,7 @@ export const known = {
   clockAhead: 0, // ms that the ground's clock is ahead of this browser's
   heardAt: 0, // when anything last came, by this browser's clock
   lost: false,
+  role: null, // what the station lets this browser do: "operator" or "screen"
 };
 
 const MAX_POINTS = 3600;

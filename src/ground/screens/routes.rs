@@ -31,24 +31,29 @@ fn answer(kind: &'static str, text: String) -> Response {
     ([(header::CONTENT_TYPE, kind)], text).into_response()
 }
 
-/// Where the asker reached this station: the name was checked to be ours.
-fn base(headers: &HeaderMap) -> String {
+/// Where this station is reached: as configured, or as the asker did, whose name for it was checked to
+/// be ours.
+fn base(station: &Station, headers: &HeaderMap) -> String {
+    if let Some(url) = &station.public_url {
+        return url.clone();
+    }
     let host = headers
         .get(header::HOST)
         .and_then(|host| host.to_str().ok());
-    format!("http://{}", host.unwrap_or("localhost"))
+    format!("{}://{}", station.scheme, host.unwrap_or("localhost"))
 }
 
-async fn network_link(headers: HeaderMap) -> Response {
+async fn network_link(State(station): Shared, headers: HeaderMap) -> Response {
     answer(
         "application/vnd.google-earth.kml+xml",
-        kml::network_link(&base(&headers)),
+        kml::network_link(&base(&station, &headers)),
     )
 }
 
 async fn incidents(State(station): Shared, headers: HeaderMap) -> Response {
     let incidents = Arc::clone(&station.screens.incidents.borrow());
-    let text = kml::document(&incidents, &aircraft(&station), &base(&headers), now());
+    let base = base(&station, &headers);
+    let text = kml::document(&incidents, &aircraft(&station), &base, now());
     answer("application/vnd.google-earth.kml+xml", text)
 }
 
@@ -58,7 +63,7 @@ async fn feed(State(station): Shared, headers: HeaderMap) -> Response {
     let Some(cap) = &station.screens.cap else {
         return refusal(StatusCode::NOT_FOUND, NO_CAP);
     };
-    match cap.feed(&base(&headers), now()) {
+    match cap.feed(&base(&station, &headers), now()) {
         Ok(feed) => answer("application/atom+xml", feed),
         Err(error) => refusal(StatusCode::SERVICE_UNAVAILABLE, error),
     }

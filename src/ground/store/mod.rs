@@ -11,6 +11,7 @@ mod server;
 pub mod sqlite;
 #[cfg(test)]
 pub(crate) mod tests;
+mod tls;
 
 use super::action::Action;
 use crate::alarm::Alarm;
@@ -19,7 +20,7 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 /// Written to the database; a newer one is refused, not guessed at.
-pub(super) const SCHEMA_VERSION: i64 = 2;
+pub(super) const SCHEMA_VERSION: i64 = 3;
 
 /// Why the store did not do what was asked.
 #[derive(Debug, thiserror::Error)]
@@ -54,6 +55,9 @@ pub enum StoreError {
         #[from]
         source: ::postgres::Error,
     },
+    /// TLS to it can't be had.
+    #[error("alarm store: {0}")]
+    Tls(#[from] tls::TlsError),
     /// What it confirms would not survive a power cut.
     #[error("alarm store: {what}: what it confirms would not survive a power cut")]
     Unsynced {
@@ -104,9 +108,13 @@ pub enum StoreError {
 }
 
 fn in_words(error: &::postgres::Error) -> String {
-    error
-        .as_db_error()
-        .map_or_else(|| error.to_string(), |said| said.message().to_owned())
+    if let Some(said) = error.as_db_error() {
+        return said.message().to_owned();
+    }
+    match std::error::Error::source(error) {
+        Some(cause) => format!("{error}: {cause}"),
+        None => error.to_string(),
+    }
 }
 
 /// How much of an alarm a link carries.
@@ -270,8 +278,10 @@ pub(super) struct BusRow {
 pub(super) struct BusCursor {
     /// Row of the journal.
     pub row: i64,
-    /// The bus's own sequence number of it.
+    /// The greatest sequence number that the bus has confirmed to us.
     pub sequence: u64,
+    /// Id of the message that has this number.
+    pub message: String,
     /// The bus's name of the stream and when it was made.
     pub stream: String,
 }

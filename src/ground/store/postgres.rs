@@ -4,17 +4,20 @@
 //! sync (`fsync = off`) is refused. Everything lies in a schema of its own, `emberfix`. Places are
 //! `geometry(Point, 4326)` under a spatial index, for the station's queries and anybody else's.
 //! A server that went away is connected to again with the next batch or question.
-//! **Known limits:** no TLS to the server: a socket on the same machine, or a guarded network.
+//! Beyond this machine the line is TLS ([`super::tls`]); the configuration sees to that.
 
 use super::super::action::{Action, Kind};
 use super::super::{bus, lock};
+use super::tls::Tls;
 use super::{
     Batch, BusCursor, BusRow, Census, Completeness, HistoryRow, Latest, Loaded, NewAction,
     NewAlarm, Rank, Row, SCHEMA_VERSION, Search, Standing, Store, StoreError, ToldAction, list,
     on_one_line, unlist,
 };
+use ::postgres::config::SslMode;
 use ::postgres::{Client, Config, NoTls, Transaction};
 use emberfix_frames::ServiceTime;
+use std::path::Path;
 use std::sync::Mutex;
 use std::time::Duration;
 
@@ -59,6 +62,7 @@ CREATE TABLE IF NOT EXISTS emberfix.bus (
     single boolean PRIMARY KEY DEFAULT true CHECK (single),
     \"row\" bigint NOT NULL, sequence bigint NOT NULL, stream text NOT NULL
 );
+ALTER TABLE emberfix.bus ADD COLUMN IF NOT EXISTS message text NOT NULL DEFAULT '';
 ";
 
 const LATEST: &str = "SELECT latest.id, latest.\"row\", latest.revision, latest.summary, first_row,
@@ -77,6 +81,7 @@ pub(in crate::ground) struct Postgres {
 /// A connection that is made anew when the server has gone.
 struct Line {
     config: Config,
+    tls: Option<Tls>,
     client: Option<Client>,
 }
 
@@ -97,7 +102,10 @@ impl Drop for Line {
 impl Line {
     fn client(&mut self) -> Result<&mut Client, StoreError> {
         if self.client.as_ref().is_none_or(Client::is_closed) {
-            let mut client = self.config.connect(NoTls)?;
+            let mut client = match self.tls.clone() {
+                Some(tls) => self.config.connect(tls)?,
+                None => self.config.connect(NoTls)?,
+            };
             client
                 .batch_execute("SET search_path = emberfix, public; SET synchronous_commit = on")?;
             self.client = Some(client);
@@ -107,17 +115,22 @@ impl Line {
 }
 
 impl Postgres {
-    /// Connects, and makes the schema where there is none. Blocks.
+    /// Connects, and makes the schema where there is none. With an authority, over TLS alone. Blocks.
     ///
     /// # Errors
     /// [`StoreError`] in the server's words.
-    pub fn open(url: &str) -> Result<Self, StoreError> {
+    pub fn open(url: &str, authority: Option<&Path>) -> Result<Self, StoreError> {
         let mut config: Config = url.parse()?;
+        let tls = authority.map(Tls::trusting).transpose()?;
+        if tls.is_some() {
+            config.ssl_mode(SslMode::Require);
+        }
         config
             .application_name("emberfix ground")
             .connect_timeout(Duration::from_secs(5));
         let line = || Line {
             config: config.clone(),
+            tls: tls.clone(),
             client: None,
         };
         let mut writer = line();
@@ -143,6 +156,16 @@ impl Postgres {
     fn number(&self, query: &str) -> Result<i64, StoreError> {
         let found = self.rows(query, &[], |row| row.try_get(0))?;
         Ok(found.into_iter().next().unwrap_or_default())
+    }
+}
+
+#[cfg(test)]
+impl Postgres {
+    /// Whether the server says that this connection is encrypted.
+    pub(super) fn is_over_tls(&self) -> Result<bool, StoreError> {
+        let query = "SELECT ssl FROM pg_stat_ssl WHERE pid = pg_backend_pid()";
+        let found: Vec<bool> = self.rows(query, &[], |row| row.try_get(0))?;
+        Ok(found == [true])
     }
 }
 
@@ -387,11 +410,13 @@ impl Store for Postgres {
     }
 
     fn bus_cursor(&self) -> Result<BusCursor, StoreError> {
-        let found = self.rows("SELECT \"row\", sequence, stream FROM bus", &[], |row| {
+        let query = "SELECT \"row\", sequence, stream, message FROM bus";
+        let found = self.rows(query, &[], |row| {
             Ok(BusCursor {
                 row: row.try_get(0)?,
                 sequence: row.try_get::<_, i64>(1)?.unsigned_abs(),
                 stream: row.try_get(2)?,
+                message: row.try_get(3)?,
             })
         })?;
         Ok(found.into_iter().next().unwrap_or_default())
@@ -532,10 +557,10 @@ fn put_rest(to: &mut Transaction<'_>, batch: &Batch) -> Result<(), StoreError> {
     if let Some(bus) = &batch.bus {
         let sequence = i64::try_from(bus.sequence).unwrap_or(i64::MAX);
         to.execute(
-            "INSERT INTO bus (\"row\", sequence, stream) VALUES ($1, $2, $3)
-             ON CONFLICT (single) DO UPDATE SET \"row\" = excluded.\"row\",
-             sequence = excluded.sequence, stream = excluded.stream",
-            &[&bus.row, &sequence, &bus.stream],
+            "INSERT INTO bus (\"row\", sequence, stream, message) VALUES ($1, $2, $3, $4)
+             ON CONFLICT (single) DO UPDATE SET \"row\" = excluded.\"row\", sequence = excluded.sequence,
+             stream = excluded.stream, message = excluded.message",
+            &[&bus.row, &sequence, &bus.stream, &bus.message],
         )?;
     }
     Ok(())

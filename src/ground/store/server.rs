@@ -1,5 +1,8 @@
 //! A PostgreSQL server of the tests' own, if this machine has one with PostGIS.
 
+use rcgen::{BasicConstraints, CertificateParams, CertifiedIssuer, IsCa, KeyPair};
+use std::fs::Permissions;
+use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
@@ -8,6 +11,7 @@ use std::time::{Duration, Instant};
 pub(super) struct Server {
     folder: tempfile::TempDir,
     programs: PathBuf,
+    port: u16,
 }
 
 /// PostgreSQL does not run as root; on a machine where the tests do, this user stands in.
@@ -28,10 +32,15 @@ impl Server {
             return Err(format!("no PostGIS: {} is not there", postgis.display()));
         }
         let folder = tempfile::tempdir().map_err(|error| error.to_string())?;
-        let server = Self { folder, programs };
+        let server = Self {
+            folder,
+            programs,
+            port: free_port(),
+        };
+        server.papers();
         if is_root() {
             let owner = Command::new("chown")
-                .arg(USER)
+                .args(["-R", USER])
                 .arg(server.folder.path())
                 .status();
             owner.map_err(|error| error.to_string())?;
@@ -51,9 +60,11 @@ impl Server {
                 "UTF8",
             ],
         )?;
+        let folder = server.folder.path().display();
         let options = format!(
-            "-k {} -c listen_addresses=''",
-            server.folder.path().display()
+            "-k {folder} -c listen_addresses=127.0.0.1 -c port={} -c ssl=on \
+             -c ssl_cert_file={folder}/server.pem -c ssl_key_file={folder}/server.key",
+            server.port
         );
         let log = server.folder.path().join("log");
         server.run(
@@ -97,10 +108,48 @@ impl Server {
         }
     }
 
+    /// A certificate for localhost, its authority, and another authority.
+    fn papers(&self) {
+        let authority = |name: &str| {
+            let mut params = CertificateParams::new(vec![name.to_owned()]).unwrap();
+            params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
+            CertifiedIssuer::self_signed(params, KeyPair::generate().unwrap()).unwrap()
+        };
+        let (ours, others) = (authority("ours"), authority("others"));
+        let key = KeyPair::generate().unwrap();
+        let params = CertificateParams::new(vec!["localhost".to_owned()]).unwrap();
+        let certificate = params.signed_by(&key, &ours).unwrap();
+        for (name, text) in [
+            ("ours.pem", ours.pem()),
+            ("others.pem", others.pem()),
+            ("server.pem", certificate.pem()),
+            ("server.key", key.serialize_pem()),
+        ] {
+            let path = self.folder.path().join(name);
+            std::fs::write(&path, text).unwrap();
+            // The server refuses a key that others may read.
+            std::fs::set_permissions(&path, Permissions::from_mode(0o600)).unwrap();
+        }
+    }
+
+    /// Address of a fresh database over TLS, the file of its authority, and that of another one.
+    pub fn over_tls(&self, name: &str) -> (String, PathBuf, PathBuf) {
+        self.database(name);
+        let url = format!(
+            "postgresql://postgres@localhost:{}/{name}?hostaddr=127.0.0.1",
+            self.port
+        );
+        let file = |name: &str| self.folder.path().join(name);
+        (url, file("ours.pem"), file("others.pem"))
+    }
+
     /// Address of a fresh database.
     pub fn database(&self, name: &str) -> String {
         let host = self.folder.path().display();
-        let to = |database: &str| format!("postgresql:///{database}?host={host}&user=postgres");
+        let port = self.port;
+        let to = |database: &str| {
+            format!("postgresql:///{database}?host={host}&port={port}&user=postgres")
+        };
         let mut client = ::postgres::Client::connect(&to("postgres"), ::postgres::NoTls).unwrap();
         client
             .batch_execute(&format!("CREATE DATABASE {name}"))
@@ -113,6 +162,11 @@ impl Drop for Server {
     fn drop(&mut self) {
         let _ = self.run("pg_ctl", &["-D", &self.data(), "-m", "immediate", "stop"]);
     }
+}
+
+fn free_port() -> u16 {
+    let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    listener.local_addr().unwrap().port()
 }
 
 fn is_root() -> bool {

@@ -85,6 +85,9 @@ CREATE TABLE bus (
 ) STRICT;
 ";
 
+/// From version 2 on: the bus is asked whether its last confirmed message is still ours.
+const SCHEMA_3: &str = "ALTER TABLE bus ADD COLUMN message TEXT NOT NULL DEFAULT ''";
+
 const LATEST: &str = "SELECT latest.id, latest.row, latest.revision, latest.summary, first_row,
     revisions, incident, feature FROM latest JOIN alarms USING (row)";
 const ACTION: &str = "SELECT number, row, key, kind, incident, alarms, others, of, by, at, note,
@@ -158,6 +161,9 @@ fn migrate(writer: &mut Connection, path: &Path) -> Result<(), StoreError> {
     }
     if found < 2 {
         transaction.execute_batch(SCHEMA_2)?;
+    }
+    if found < 3 {
+        transaction.execute_batch(SCHEMA_3)?;
     }
     transaction.pragma_update(None, "user_version", SCHEMA_VERSION)?;
     Ok(transaction.commit()?)
@@ -351,12 +357,13 @@ impl Store for Sqlite {
     }
 
     fn bus_cursor(&self) -> Result<BusCursor, StoreError> {
-        let query = "SELECT row, sequence, stream FROM bus";
+        let query = "SELECT row, sequence, stream, message FROM bus";
         let found = self.rows(query, [], |row| {
             Ok(BusCursor {
                 row: row.get(0)?,
                 sequence: row.get::<_, i64>(1)?.unsigned_abs(),
                 stream: row.get(2)?,
+                message: row.get(3)?,
             })
         })?;
         Ok(found.into_iter().next().unwrap_or_default())
@@ -466,12 +473,13 @@ fn put_rest(transaction: &Transaction<'_>, batch: &Batch) -> rusqlite::Result<()
     }
     if let Some(bus) = &batch.bus {
         transaction.execute(
-            "INSERT INTO bus VALUES (1, ?1, ?2, ?3)
-             ON CONFLICT (only) DO UPDATE SET row = ?1, sequence = ?2, stream = ?3",
+            "INSERT INTO bus (only, row, sequence, stream, message) VALUES (1, ?1, ?2, ?3, ?4)
+             ON CONFLICT (only) DO UPDATE SET row = ?1, sequence = ?2, stream = ?3, message = ?4",
             params![
                 bus.row,
                 i64::try_from(bus.sequence).unwrap_or(i64::MAX),
-                bus.stream
+                bus.stream,
+                bus.message
             ],
         )?;
     }

@@ -149,7 +149,7 @@ fn sqlite() -> Place {
 fn postgres(server: &Server, name: &str) -> Place {
     let url = server.database(name);
     Place {
-        open: Box::new(move || Arc::new(Postgres::open(&url).unwrap())),
+        open: Box::new(move || Arc::new(Postgres::open(&url, None).unwrap())),
     }
 }
 
@@ -201,6 +201,7 @@ macro_rules! contract {
                 println!("{}", stringify!($name));
                 block_on($name(postgres(&server, stringify!($name))));
             )*
+            over_tls_only_the_authoritys_server_is_believed(&server);
         }
     };
 }
@@ -216,6 +217,21 @@ contract! {
     operators_merge_and_split_and_take_it_back
     area_and_time_find_what_is_there
     a_batch_is_kept_whole_or_not_at_all
+}
+
+fn over_tls_only_the_authoritys_server_is_believed(server: &Server) {
+    println!("over TLS");
+    let (url, ours, others) = server.over_tls("tls");
+    let store = Postgres::open(&url, Some(&ours)).unwrap();
+    assert_eq!(store.census().unwrap().alarms, 0);
+    assert!(store.is_over_tls().unwrap());
+    let refused = Postgres::open(&url, Some(&others)).unwrap_err();
+    assert!(refused.to_string().contains("certificate"), "{refused}");
+    let another_name = url.replace("localhost", "elsewhere.example");
+    assert!(Postgres::open(&another_name, Some(&ours)).is_err());
+    // A server that has no TLS gets no password in the clear.
+    let plain = server.database("plain");
+    assert!(Postgres::open(&plain, Some(&ours)).is_err());
 }
 
 async fn a_repeated_delivery_is_acknowledged_and_changes_nothing(place: Place) {

