@@ -146,7 +146,7 @@ fn where_a_token_is_asked_for_the_page_asks_and_shows_what_the_token_allows() {
     told.send_json(fire()).unwrap();
 
     // Nobody yet: the page asks, and says so when the token is wrong.
-    let mut browser = self::browser(&clients, &station);
+    let mut browser = browser(&clients, &station);
     browser.args(["--scheme", "dark", "--phone", "--window", "390x844"]);
     for step in [
         "wait:Access token of this ground station",

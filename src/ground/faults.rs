@@ -101,7 +101,7 @@ const GROUND: &[(&str, &[Proof])] = &[
                 "a_picture_takes_500_bytes_a_second_and_no_time_of_an_alarm",
             ),
             (
-                "src/deliver/mavlink.rs",
+                "src/deliver/mavlink/tests.rs",
                 "frames_keep_their_distance_and_their_share_of_the_link",
             ),
         ],

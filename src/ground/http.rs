@@ -92,31 +92,46 @@ async fn count_refusals(State(station): Shared, request: Request, next: Next) ->
     response
 }
 
-/// Refuses an aircraft that speaks in another's name, or of another's alarm.
+/// What an alarm or a position says of itself.
+#[derive(Deserialize)]
+struct Named {
+    uav: String,
+    id: Option<String>,
+}
+
+impl Named {
+    /// What names nobody is refused where it is read.
+    fn read(body: &[u8]) -> Option<Self> {
+        #[derive(Deserialize)]
+        struct Alarm {
+            properties: Named,
+        }
+        let alarm = serde_json::from_slice::<Alarm>(body).map(|alarm| alarm.properties);
+        alarm.or_else(|_| serde_json::from_slice(body)).ok()
+    }
+}
+
+/// Refuses an aircraft that speaks in another's name.
 fn speaks(caller: &Caller, body: &[u8]) -> Option<Response> {
-    #[derive(Deserialize)]
-    struct Named {
-        uav: String,
-        id: Option<String>,
-    }
-    #[derive(Deserialize)]
-    struct Alarm {
-        properties: Named,
-    }
     let Caller::Known(access) = caller else {
         return None;
     };
-    let alarm = serde_json::from_slice::<Alarm>(body).map(|alarm| alarm.properties);
-    let named = alarm.or_else(|_| serde_json::from_slice::<Named>(body));
-    match named {
-        // What names nobody is refused where it is read.
-        Ok(named) if !caller.speaks_for(&named.uav) => Some(not_for(access, &named.uav)),
-        Ok(Named { uav, id: Some(id) }) if !is_own(&id, &uav) => {
-            let reason = format!("alarm {id:?} is none of {uav:?}");
-            Some(refusal(StatusCode::FORBIDDEN, reason))
-        }
-        _ => None,
+    let named = Named::read(body)?;
+    (!caller.speaks_for(&named.uav)).then(|| not_for(access, &named.uav))
+}
+
+/// Refuses an aircraft that speaks in another's name, or of another's alarm.
+fn owns(caller: &Caller, body: &[u8]) -> Option<Response> {
+    let Caller::Known(_) = caller else {
+        return None;
+    };
+    if let Some(refused) = speaks(caller, body) {
+        return Some(refused);
     }
+    let Named { uav, id } = Named::read(body)?;
+    let id = id.filter(|id| !is_own(id, &uav))?;
+    let reason = format!("alarm {id:?} is none of {uav:?}");
+    Some(refusal(StatusCode::FORBIDDEN, reason))
 }
 
 fn not_for(access: &Access, uav: &str) -> Response {
@@ -273,7 +288,7 @@ async fn post_alarm(
             return error.answer();
         }
     };
-    if let Some(refused) = speaks(&caller, &body) {
+    if let Some(refused) = owns(&caller, &body) {
         return refused;
     }
     let header = headers

@@ -87,7 +87,7 @@ export function sizeText(p, alarm) {
 export function areaText(alarm) {
   const area = alarm?.properties.area?.square_metres;
   if (!area) return null;
-  const round = (v) => (v < 10 ? v.toFixed(1) : Math.round(v).toString());
+  const digits = area.value < 10 ? 1 : 0, round = (v) => v.toFixed(digits);
   return `${round(area.value)} ± ${round(area.sigma)} m² burning`;
 }
 
