@@ -66,6 +66,9 @@ struct RawCamera {
     focal_px: [f64; 2],
     principal_point_px: [f64; 2],
     distortion: Vec<f64>,
+    /// Only of the right eye: the left one sees colour, or there are no flames to find.
+    #[serde(default)]
+    near_infrared: bool,
 }
 
 #[derive(Deserialize)]
@@ -136,6 +139,7 @@ const KNOWN: &[&str] = &[
     "right.focal_px",
     "right.principal_point_px",
     "right.distortion",
+    "right.near_infrared",
     "stereo.right_from_left_rotation_deg",
     "stereo.right_from_left_translation_m",
     "stereo.max_skew_s",
@@ -389,6 +393,7 @@ fn build(raw: RawRig, path: &Path) -> Result<Rig, RigError> {
         ));
     }
     Ok(Rig {
+        right_near_infrared: raw.right.near_infrared,
         name: raw.name,
         left,
         right,

@@ -106,6 +106,7 @@ pub struct Rig {
     rectification: Rectification,
     calibrated: Option<Calibrated>,
     doubts: Vec<Finding>,
+    right_near_infrared: bool,
 }
 
 impl Rig {
@@ -192,6 +193,11 @@ impl Rig {
     #[must_use]
     pub fn doubts(&self) -> &[Finding] {
         &self.doubts
+    }
+    /// Whether the right eye sees near infrared, where the left one sees colour (P4's rig).
+    #[must_use]
+    pub fn right_near_infrared(&self) -> bool {
+        self.right_near_infrared
     }
     /// The rectified pair's geometry and the way into it.
     #[must_use]

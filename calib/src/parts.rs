@@ -8,7 +8,8 @@ use emberfix_frames::{
 use std::fmt::Write as _;
 use std::path::Path;
 
-/// How the left camera stands on the airframe, and what its clock is worth: no picture tells.
+/// How the left camera stands on the airframe, what its clock is worth, and which light the right eye
+/// sees: no picture tells.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Mounting {
     /// Boresight on the airframe.
@@ -23,6 +24,8 @@ pub struct Mounting {
     pub lever_arm_sigma_m: f64,
     /// One sigma of the time offset, seconds.
     pub time_offset_sigma_s: f64,
+    /// The right eye sees near infrared, the left one colour.
+    pub right_near_infrared: bool,
 }
 
 impl Mounting {
@@ -36,6 +39,7 @@ impl Mounting {
             boresight_sigma_rad: rig.sigmas().boresight_rad,
             lever_arm_sigma_m: rig.sigmas().lever_arm_m,
             time_offset_sigma_s: rig.sigmas().time_offset_s,
+            right_near_infrared: rig.right_near_infrared(),
         }
     }
 }
@@ -120,6 +124,10 @@ impl RigParts {
         let mut text = format!("name = {}\n", toml::Value::from(self.name.as_str()));
         for (eye, camera) in [("left", &self.left), ("right", &self.right)] {
             write_camera(&mut text, eye, camera);
+        }
+        if self.mounting.right_near_infrared {
+            // Still in the right eye's table.
+            text.push_str("near_infrared = true\n");
         }
         self.write_pair(&mut text);
         self.write_mounting(&mut text);
@@ -265,7 +273,10 @@ mod tests {
             held_out_rms_px: 0.25,
             range_sigma_at_10m_percent: 0.2,
         });
+        assert!(!parts.mounting.right_near_infrared);
+        parts.mounting.right_near_infrared = true;
         let again = RigParts::of(&parts.check(Path::new("again.toml")).unwrap());
+        assert!(again.mounting.right_near_infrared);
         assert_eq!(again.left, parts.left);
         assert_eq!(again.right, parts.right);
         assert_eq!(again.calibrated, parts.calibrated);

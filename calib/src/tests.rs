@@ -394,3 +394,13 @@ fn a_rectified_pixel_at_the_principal_point_looks_along_the_boresight() {
         .metres();
     assert!(ray.x > 0.0 && ray.y > 0.0);
 }
+
+#[test]
+fn the_right_eye_may_see_near_infrared_and_the_left_one_may_not() {
+    assert!(!rig().right_near_infrared());
+    let right = parse(&with("[right]\n", "[right]\nnear_infrared = true\n")).unwrap();
+    assert!(right.right_near_infrared());
+    let left = parse(&with("[left]\n", "[left]\nnear_infrared = true\n"));
+    let message = left.unwrap_err().to_string();
+    assert!(message.contains("left.near_infrared"), "{message}");
+}

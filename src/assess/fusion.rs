@@ -63,11 +63,15 @@ impl ChannelFault {
     #[must_use]
     pub fn words(self, channel: Channel) -> &'static str {
         match (channel, self) {
-            (Channel::Spectral, Self::Silent) => "intensity without the spectrometer: it is silent",
-            (Channel::Spectral, Self::Blinded) => {
-                "intensity without the spectrometer: it is blinded"
+            (Channel::Spectral, Self::Silent) => {
+                "intensity without the spectral channel: it is silent"
             }
-            (Channel::Spectral, Self::Frozen) => "intensity without the spectrometer: it is frozen",
+            (Channel::Spectral, Self::Blinded) => {
+                "intensity without the spectral channel: it is blinded"
+            }
+            (Channel::Spectral, Self::Frozen) => {
+                "intensity without the spectral channel: it is frozen"
+            }
             (Channel::Visible, Self::Silent) => {
                 "intensity without the camera: no flame in its picture"
             }

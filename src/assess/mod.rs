@@ -8,7 +8,8 @@
 //! oval and its motion, [`fusion`] two channels into one intensity, [`trend`] that into growing, steady or dying; [`watch`] keeps all
 //! of it per fire. [`printed`] is P1's fusion, to measure against.
 //!
-//! **Known limits.** A spectrometer sees the whole scene: its light is used while one fire is seen.
+//! **Known limits.** A spectrometer sees the whole scene: its light is used while one fire is seen. A near-infrared
+//! eye shows each fire by itself.
 
 pub mod extent;
 mod front;

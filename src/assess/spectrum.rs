@@ -3,8 +3,8 @@
 //!
 //! **In:** one reading of a `/spectrometer` stream: wavelengths in nm, intensities in any unit that is
 //! proportional to light. **Out:** the light of the lines above what lies beside them, in the same
-//! unit times nm. A near-infrared eye with a potassium filter can stand in for it: its sum of pixels
-//! above their surroundings is a sample of the same channel.
+//! unit times nm. A near-infrared eye can stand in for it, best with a potassium filter: what stands out of
+//! a box's surroundings in its picture (`pipeline`) is a sample of the same channel.
 
 use emberfix_frames::ServiceTime;
 use serde::Serialize;

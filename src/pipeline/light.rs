@@ -2,11 +2,13 @@
 //!
 //! Levels are taken back to light by the cameras' gamma and divided by the scene's own level outside
 //! of all boxes, so that an exposure that changes is not taken for a fire that does. A red channel
-//! that saturates counts as full: area says the rest.
+//! that saturates counts as full: area says the rest. Of a near-infrared eye's picture it is what stands
+//! out of a box's surroundings: soot and potassium shine there, and smoke is thin.
 
 use crate::detect::BoxPx;
-use opencv::core::{Mat, MatTraitConst, Vec3b};
+use opencv::core::{DataType, Mat, MatTraitConst, Vec3b};
 use opencv::prelude::MatTraitConstManual;
+use std::ops::Range;
 
 /// Gamma of the cameras' pictures.
 const GAMMA: f64 = 2.2;
@@ -19,51 +21,108 @@ const FULL: u8 = 250;
 const STRIDE: usize = 16;
 /// Margin about a box: its edges jitter, light must not.
 const MARGIN: f64 = 0.1;
+/// Margin at whose edge a box's surroundings are read in near infrared, as a share of it.
+const SURROUNDINGS: f64 = 0.5;
+/// Grey levels by which a pixel stands out of them; noise does not.
+const STANDS_OUT: u8 = 20;
 /// A scene darker than this says nothing of exposure; full light is 1.
 const LEAST_SCENE: f64 = 0.002;
 
-/// Median light of the scene outside the boxes, full scale 1. `None` when hardly anything is outside,
-/// or it is dark.
+/// Median light of the scene outside the boxes in the left eye's picture, full scale 1. `None` when
+/// hardly anything is outside, or it is dark.
 pub fn scene_level(bgr: &Mat, boxes: &[BoxPx]) -> Option<f64> {
+    scene(bgr, boxes, |pixel: &Vec3b| pixel[1])
+}
+
+/// The same in the right eye's grey picture.
+pub fn scene_level_grey(grey: &Mat, boxes: &[BoxPx]) -> Option<f64> {
+    scene(grey, boxes, |pixel: &u8| *pixel)
+}
+
+fn scene<P: DataType>(image: &Mat, boxes: &[BoxPx], level: impl Fn(&P) -> u8) -> Option<f64> {
     let mut levels = Vec::new();
-    for row in (0..bgr.rows()).step_by(STRIDE) {
-        let pixels = bgr.at_row::<Vec3b>(row).ok()?;
+    for row in (0..image.rows()).step_by(STRIDE) {
+        let pixels = image.at_row::<P>(row).ok()?;
         for (column, pixel) in pixels.iter().enumerate().step_by(STRIDE) {
             if !boxes
                 .iter()
                 .any(|found| holds(found, column as f64, f64::from(row)))
             {
-                levels.push(pixel[1]);
+                levels.push(level(pixel));
             }
         }
     }
     if levels.len() < 50 {
         return None;
     }
+    Some(light(median(&mut levels)?)).filter(|level| *level >= LEAST_SCENE)
+}
+
+fn median(levels: &mut [u8]) -> Option<u8> {
     let middle = levels.len() / 2;
-    let (_, median, _) = levels.select_nth_unstable(middle);
-    Some(light(*median)).filter(|level| *level >= LEAST_SCENE)
+    (!levels.is_empty()).then(|| *levels.select_nth_unstable(middle).1)
 }
 
 /// Flame in a box: the sum of its pixels' red light over the scene's level, pixels. `None` when no
 /// pixel is flame: that flame was not seen, not that it is out.
 pub fn flame(bgr: &Mat, found: &BoxPx, scene: f64) -> Option<f64> {
-    let clamp = |value: f64, size: i32| (value.round() as i32).clamp(0, size);
-    let (across, down) = (MARGIN * found.width, MARGIN * found.height);
-    let columns =
-        clamp(found.x - across, bgr.cols())..clamp(found.x + found.width + across, bgr.cols());
-    let rows = clamp(found.y - down, bgr.rows())..clamp(found.y + found.height + down, bgr.rows());
+    let (columns, rows) = inside(bgr, found, MARGIN);
     let mut sum = 0.0;
     for row in rows {
         let pixels = bgr.at_row::<Vec3b>(row).ok()?;
-        let inside = pixels.get(columns.start as usize..columns.end as usize)?;
-        sum += inside
+        sum += pixels
+            .get(columns.clone())?
             .iter()
             .filter(|pixel| is_flame(pixel))
             .map(|pixel| light(pixel[2]))
             .sum::<f64>();
     }
     (sum > 0.0).then_some(sum / scene)
+}
+
+/// Near-infrared light in a box of the right eye: the sum of its pixels above what surrounds it, over
+/// the scene's level, pixels. `None` when nothing stands out: it was not seen, not that it is out.
+pub fn near_infrared(grey: &Mat, found: &BoxPx, scene: f64) -> Option<f64> {
+    let around = surroundings(grey, found)?;
+    let (columns, rows) = inside(grey, found, MARGIN);
+    let mut sum = 0.0;
+    for row in rows {
+        let pixels = grey.at_row::<u8>(row).ok()?;
+        sum += pixels
+            .get(columns.clone())?
+            .iter()
+            .filter(|level| **level >= around.saturating_add(STANDS_OUT))
+            .map(|level| light(*level) - light(around))
+            .sum::<f64>();
+    }
+    (sum > 0.0).then_some(sum / scene)
+}
+
+/// Median grey level along the edge of a box that is larger by [`SURROUNDINGS`].
+fn surroundings(grey: &Mat, found: &BoxPx) -> Option<u8> {
+    let (columns, rows) = inside(grey, found, SURROUNDINGS);
+    let mut levels = Vec::new();
+    for row in rows.clone() {
+        let pixels = grey.at_row::<u8>(row).ok()?.get(columns.clone())?;
+        if row == rows.start || row + 1 == rows.end {
+            levels.extend_from_slice(pixels);
+        } else {
+            levels.extend(pixels.first());
+            levels.extend(pixels.last());
+        }
+    }
+    median(&mut levels)
+}
+
+/// Columns and rows of a box with a margin, as a share of it, that the picture holds.
+fn inside(image: &Mat, found: &BoxPx, margin: f64) -> (Range<usize>, Range<i32>) {
+    let clamp = |value: f64, size: i32| (value.round() as i32).clamp(0, size);
+    let (across, down) = (margin * found.width, margin * found.height);
+    let columns =
+        clamp(found.x - across, image.cols())..clamp(found.x + found.width + across, image.cols());
+    let rows =
+        clamp(found.y - down, image.rows())..clamp(found.y + found.height + down, image.rows());
+    (columns.start as usize..columns.end as usize, rows)
 }
 
 fn is_flame(pixel: &Vec3b) -> bool {
@@ -83,7 +142,7 @@ fn holds(found: &BoxPx, column: f64, row: f64) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use opencv::core::{CV_8UC3, MatTrait, Scalar};
+    use opencv::core::{CV_8UC1, CV_8UC3, MatTrait, Scalar};
 
     const BOX: BoxPx = BoxPx {
         x: 100.0,
@@ -130,5 +189,47 @@ mod tests {
         assert_eq!(shown(0, 1.0), None);
         let black = Mat::new_rows_cols_with_default(300, 400, CV_8UC3, Scalar::all(0.0)).unwrap();
         assert_eq!(scene_level(&black, &[]), None);
+    }
+
+    /// A grey picture with a bright square in the box, all of it under one gain.
+    fn grey_scene(side_px: i32, of_full: f64, gain: f64) -> Mat {
+        let level = |of_full: f64| 255.0 * (of_full * gain).min(1.0).powf(1.0 / GAMMA);
+        let mut grey =
+            Mat::new_rows_cols_with_default(300, 400, CV_8UC1, Scalar::all(level(0.15))).unwrap();
+        for k in 0..side_px * side_px {
+            let pixel = grey
+                .at_2d_mut::<u8>(105 + k / side_px, 105 + k % side_px)
+                .unwrap();
+            *pixel = level(of_full) as u8;
+        }
+        grey
+    }
+
+    fn shown_in_infrared(side_px: i32, of_full: f64, gain: f64) -> Option<f64> {
+        let grey = grey_scene(side_px, of_full, gain);
+        near_infrared(&grey, &BOX, scene_level_grey(&grey, &[BOX]).unwrap())
+    }
+
+    #[test]
+    fn near_infrared_is_what_stands_out_of_the_surroundings_whatever_the_exposure() {
+        let one = shown_in_infrared(10, 0.5, 1.0).unwrap();
+        // 100 pixels of (0.5 - 0.15) / 0.15.
+        assert!((one / 233.0 - 1.0).abs() < 0.03, "{one}");
+        assert!((shown_in_infrared(20, 0.5, 1.0).unwrap() / one - 4.0).abs() < 0.01);
+        for gain in [0.7, 1.6] {
+            let other = shown_in_infrared(10, 0.5, gain).unwrap();
+            assert!((other / one - 1.0).abs() < 0.05, "{gain}: {other} {one}");
+        }
+        // Ground in the box that is as bright as around it is no flame.
+        assert_eq!(shown_in_infrared(20, 0.15, 1.0), None);
+    }
+
+    #[test]
+    fn a_box_over_the_edge_of_a_picture_or_outside_of_it_is_no_panic() {
+        let grey = grey_scene(10, 0.5, 1.0);
+        for (x, y) in [(-20.0, 290.0), (390.0, -30.0), (1e4, 1e4), (-1e4, 0.0)] {
+            let outside = BoxPx { x, y, ..BOX };
+            assert_eq!(near_infrared(&grey, &outside, 0.15), None);
+        }
     }
 }

@@ -535,14 +535,14 @@ impl Pipeline {
         outcomes: &[Outcome],
         view: &View<'_>,
     ) {
-        let spectral = self.spectral(pair, outcomes);
+        let spectral = self.spectral(pair, seen, outcomes);
         let fresh = self
             .wind
             .as_ref()
             .filter(|wind| self.now - wind.at < WIND_AGE);
         let wind = fresh.map(|wind| wind.value);
         let fires = self.tracker.fires();
-        for outcome in outcomes {
+        for (outcome, spectral) in outcomes.iter().zip(spectral) {
             let Some(fire) = fires.iter().find(|fire| Some(fire.id) == outcome.fire) else {
                 continue;
             };
@@ -558,9 +558,28 @@ impl Pipeline {
             .keep(|id| fires.iter().any(|fire| fire.id == id));
     }
 
+    /// The spectral light of each outcome. A near-infrared eye shows each fire by itself; a spectrometer
+    /// speaks of one fire alone. A rig with such an eye uses it always: the two have different units.
+    fn spectral(
+        &mut self,
+        pair: &Stamped<StereoPair>,
+        seen: &Seen,
+        outcomes: &[Outcome],
+    ) -> Vec<Option<f64>> {
+        if !self.rig.right_near_infrared() {
+            return vec![self.of_spectrometer(pair, outcomes); outcomes.len()];
+        }
+        if !pair.value.spectra.is_empty() {
+            self.counters
+                .add("spectrometer", "near_infrared_eye_instead");
+        }
+        let of = |outcome: &Outcome| seen.near_infrared.get(outcome.index).copied().flatten();
+        outcomes.iter().map(of).collect()
+    }
+
     /// Mean light of the lines since the pair before. The instrument sees the whole scene, so it
     /// speaks of a fire only when one alone is seen.
-    fn spectral(&mut self, pair: &Stamped<StereoPair>, outcomes: &[Outcome]) -> Option<f64> {
+    fn of_spectrometer(&mut self, pair: &Stamped<StereoPair>, outcomes: &[Outcome]) -> Option<f64> {
         let mut lights = Vec::new();
         for spectrum in &pair.value.spectra {
             let light = spectrum.line_light();

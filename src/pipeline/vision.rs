@@ -23,6 +23,9 @@ pub struct Seen {
     pub sightings: Vec<(usize, Classified)>,
     /// Flame that each of `sightings` shows, over the light of the scene; `None` where none is seen.
     pub flames: Vec<Option<f64>>,
+    /// Near-infrared light of each, of the scene's, where the right eye sees that; `None` where it does
+    /// not, or nobody knows where in its picture to look.
+    pub near_infrared: Vec<Option<f64>>,
     /// True when the right eye was of no use.
     pub mono: bool,
     /// Both eyes against each other; once in `COMPARE_EVERY`.
@@ -105,13 +108,68 @@ impl Vision {
             .iter()
             .map(|(index, _)| light::flame(&raw.left_bgr, &boxes[*index], scene?))
             .collect();
+        let near_infrared = self.near_infrared(&raw, &sightings, counters);
         Some(Seen {
             eyes: self.compare(&raw, counters),
+            near_infrared,
             flames,
             found,
             sightings,
             mono: raw.right_gray.is_none(),
             left_bgr: raw.left_bgr,
+        })
+    }
+
+    /// What a near-infrared right eye shows of each sighting.
+    fn near_infrared(
+        &self,
+        pair: &RawPair,
+        sightings: &[(usize, Classified)],
+        counters: &mut Counters,
+    ) -> Vec<Option<f64>> {
+        let right = pair.right_gray.as_ref();
+        let Some(grey) = right.filter(|_| self.rig.right_near_infrared()) else {
+            return vec![None; sightings.len()];
+        };
+        let placed = sightings
+            .iter()
+            .map(|(_, seen)| self.right_box(&seen.sighting));
+        let boxes: Vec<Option<BoxPx>> = placed.collect();
+        let known: Vec<BoxPx> = boxes.iter().flatten().copied().collect();
+        let scene = light::scene_level_grey(grey, &known);
+        let mut shown = |found: &Option<BoxPx>| {
+            let light = found
+                .zip(scene)
+                .and_then(|(found, scene)| light::near_infrared(grey, &found, scene));
+            let name = match (found, light) {
+                (None, _) => "no_disparity",
+                (_, None) => "no_flame",
+                _ => "seen",
+            };
+            counters.add("near_infrared", name);
+            light
+        };
+        boxes.iter().map(&mut shown).collect()
+    }
+
+    /// A sighting's box in the right eye's raw picture, by its disparity.
+    fn right_box(&self, sighting: &Sighting) -> Option<BoxPx> {
+        let disparity_px = sighting.disparity?.px;
+        let (width, height) = sighting.size_px;
+        let rectification = self.rig.rectification();
+        let corner = |across: f64, up: f64| {
+            let pixel = RectifiedPixel {
+                u: sighting.base.u - disparity_px + across * width,
+                v: sighting.base.v - up * height,
+            };
+            rectification.unrectify(Eye::Right, pixel)
+        };
+        let (low, high) = (corner(-0.5, 0.0), corner(0.5, 1.0));
+        Some(BoxPx {
+            x: low.u,
+            y: high.v,
+            width: high.u - low.u,
+            height: low.v - high.v,
         })
     }
 

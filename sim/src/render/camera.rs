@@ -43,6 +43,7 @@ pub struct StereoCamera {
     right_in_left_m: Vector3<f64>,
     /// Left camera's centre in body (forward, right, down) components, metres.
     lever_arm_m: Vector3<f64>,
+    right_near_infrared: bool,
 }
 
 impl StereoCamera {
@@ -60,6 +61,7 @@ impl StereoCamera {
             right_in_left_m: -(left_from_right * rig.right_from_left_translation_m()),
             left_from_right,
             lever_arm_m: rig.lever_arm().metres(),
+            right_near_infrared: rig.right_near_infrared(),
         }
     }
 
@@ -83,6 +85,11 @@ impl StereoCamera {
     /// Takes left-camera components to body (forward, right, down).
     pub(crate) fn body_from_left(&self) -> &Matrix3<f64> {
         &self.body_from_left
+    }
+
+    /// Whether an eye sees just beyond red instead of light.
+    pub(crate) fn is_near_infrared(&self, eye: Eye) -> bool {
+        eye == Eye::Right && self.right_near_infrared
     }
 
     pub(crate) fn lens(&self, eye: Eye) -> &Lens {

@@ -101,6 +101,15 @@ pub(super) struct Band {
 }
 
 impl Band {
+    /// Light becomes near infrared: plants are bright where they are green, all else is about as bright
+    /// as it is red.
+    pub(super) fn turn_near_infrared(&mut self) {
+        for [red, green, blue, _] in &mut self.colour {
+            let light = 0.8 * *red + 1.5 * (1.6 * *green - *red).max(0.0);
+            (*red, *green, *blue) = (light, light, light);
+        }
+    }
+
     /// Rows of the image that it holds.
     pub(super) fn extent_rows(&self) -> std::ops::Range<usize> {
         self.top..self.top + self.rows

@@ -123,7 +123,15 @@ impl Renderer {
         let (lens, pose) = (self.camera.lens(eye), self.camera.pose(eye, body));
         let ground = Ground::new(&self.world, pose, self.rays(eye), &self.marks, t_s);
         let solids = Solids::new(self.world.things(), &pose, lens);
-        let splats = splats::seen(self.shining(&pose, t_s), &pose, lens);
+        let near_infrared = self.camera.is_near_infrared(eye);
+        let shining = self.shining(&pose, t_s).map(|splat| {
+            if near_infrared {
+                splats::in_near_infrared(splat)
+            } else {
+                splat
+            }
+        });
+        let splats = splats::seen(shining, &pose, lens);
         let exposure = self.sensor.exposure(eye, t_s);
         let channels = eye.channels();
         let mut bytes = vec![0; lens.width * lens.height * channels];
@@ -133,6 +141,9 @@ impl Renderer {
             .for_each(|(row, out)| {
                 let mut band = ground.band(row, lens.width, lens.height);
                 solids.draw(&mut band, &ground);
+                if near_infrared {
+                    band.turn_near_infrared();
+                }
                 self.draw_splats(&mut band, &splats);
                 self.sensor.develop(&band, lens.height, exposure, out);
             });

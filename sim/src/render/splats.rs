@@ -183,3 +183,25 @@ pub(super) fn billows(textures: &Textures) -> Lod<'_> {
 pub(super) fn ray_to(splat: &Splat, pose: &EyePose) -> Vector3<f64> {
     splat.centre_m - pose.origin_m
 }
+
+/// A splat as it is seen just beyond red: the cooler (redder) its soot, the more light; smoke is thinner.
+pub(super) fn in_near_infrared(splat: Splat) -> Splat {
+    let [red, green, blue] = splat.colour;
+    let light = match splat.kind {
+        SplatKind::Flame => {
+            let redness = 1.0 - green / red.max(1e-6);
+            red * (0.8 + 1.2 * redness * redness)
+        }
+        SplatKind::Smoke | SplatKind::Light => (red + green + blue) / 3.0,
+    };
+    let thinner = if splat.kind == SplatKind::Smoke {
+        0.6
+    } else {
+        1.0
+    };
+    Splat {
+        colour: [light; 3],
+        opacity: thinner * splat.opacity,
+        ..splat
+    }
+}

@@ -14,7 +14,7 @@
 use super::camera::{EyePose, Lens};
 use super::ground::{BLOCK, RayGrid};
 use super::sensor::Sensor;
-use super::splats::SeenSplat;
+use super::splats::{SeenSplat, in_near_infrared};
 use super::{Frame, PixelBox, PixelFormat, RenderConfig, StereoCamera};
 use crate::state::BodyState;
 use crate::world::{Flame, Splat, SplatKind, Textures, UNIT, World, hash};
@@ -390,13 +390,11 @@ impl Puff {
 impl View<'_> {
     /// A splat as this eye sees it, in its kind of light.
     fn item(&self, splat: &Splat, lens: &Lens, axis: Option<&Vector3<f64>>) -> Option<Item> {
-        let mut splat = *splat;
-        if self.look.near_infrared {
-            splat.colour = infrared(splat.kind, splat.colour);
-            if splat.kind == SplatKind::Smoke {
-                splat.opacity *= 0.6;
-            }
-        }
+        let splat = if self.look.near_infrared {
+            in_near_infrared(*splat)
+        } else {
+            *splat
+        };
         let seen = SeenSplat::beyond(NEAREST_M, &splat, &self.pose, lens)?;
         let inverse_depth =
             axis.map(|axis| (1.0 / (splat.centre_m - self.pose.origin_m).dot(axis)) as f32);
@@ -407,18 +405,6 @@ impl View<'_> {
             texel_px: seen_px,
         })
     }
-}
-
-/// Light of a splat just beyond red: the cooler (redder) its soot, the more of it.
-fn infrared(kind: SplatKind, [red, green, blue]: [f32; 3]) -> [f32; 3] {
-    let light = match kind {
-        SplatKind::Flame => {
-            let redness = 1.0 - green / red.max(1e-6);
-            red * (0.8 + 1.2 * redness * redness)
-        }
-        SplatKind::Smoke | SplatKind::Light => (red + green + blue) / 3.0,
-    };
-    [light; 3]
 }
 
 fn fineness(shot: &Shot, view: &View) -> usize {

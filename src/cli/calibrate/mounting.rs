@@ -36,6 +36,9 @@ pub struct MountingArguments {
     /// One sigma of the time offset, seconds; 0.05 is a guess.
     #[arg(long, help_heading = MOUNT)]
     time_offset_sigma_s: Option<f64>,
+    /// The right eye sees near infrared.
+    #[arg(long, help_heading = MOUNT)]
+    right_near_infrared: bool,
     /// Greatest difference of the eyes' exposures that is one moment, seconds.
     #[arg(long, help_heading = MOUNT)]
     max_skew_s: Option<f64>,
@@ -153,6 +156,10 @@ impl MountingArguments {
                 of(|m| m.time_offset_sigma_s),
                 "--time-offset-sigma-s",
             ),
+            right_near_infrared: self.right_near_infrared
+                || like
+                    .as_ref()
+                    .is_some_and(|(mounting, _)| mounting.right_near_infrared),
         };
         let max_skew_s = number(
             self.max_skew_s,

@@ -133,6 +133,7 @@ fn make_up(random: &mut impl Rng, infrared: bool) -> RigParts {
             boresight_sigma_rad: 0.0,
             lever_arm_sigma_m: 0.0,
             time_offset_sigma_s: 0.0,
+            right_near_infrared: false,
         },
         calibrated: None,
     }
