@@ -2,7 +2,7 @@
 
 use super::{Action, Advice, Alarm, AlarmProperties, Attention, FireId, FireState};
 use super::{Area, Burning, SizeM, TrendProbability};
-use crate::assess::extent::{Measured, SizeClass};
+use crate::assess::extent::{Extent, Measured};
 use crate::assess::trend::Course;
 use crate::assess::watch::Assessment;
 use crate::track::Fire;
@@ -241,7 +241,7 @@ fn burning(situation: &Situation) -> Burning {
     let size = size(assessment);
     Burning {
         size_sigma_m: size.map(|(_, sigma)| sigma),
-        size_class: size.map(|(size, _)| SizeClass::of(size.width, size.height)),
+        size_class: assessment.extent.as_ref().map(Extent::class),
         trend_sigma: assessment.trend.map(|trend| trend.slope.sigma),
         trend_probability: assessment.trend.map(|trend| TrendProbability {
             growing: trend.growing,

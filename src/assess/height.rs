@@ -14,7 +14,7 @@ use nalgebra::{Matrix4, Vector2, Vector4};
 const TIP_AT: f64 = 0.35;
 const TIP_FARTHER: f64 = 0.55;
 /// One sigma of that share.
-const TIP_SIGMA: f64 = 0.15;
+const TIP_SIGMA: f64 = 0.07;
 /// Lean of a flame in the wind against its height: `LEAN u / sqrt(g h)`, at most [`MOST_LEAN`].
 const LEAN: f64 = 0.3;
 const MOST_LEAN: f64 = 1.2;
@@ -25,40 +25,82 @@ const UNKNOWN_LEAN: f64 = 0.35;
 const CHANGE: f64 = 0.15;
 /// Flicker of one look's height, as a share; the looks' own scatter replaces it.
 const FLICKER: f64 = 0.15;
+/// Times that height and tip are worked out from each other.
+const SETTLING: usize = 8;
 /// Height is never told below this share of the box's.
 const LEAST_SHARE: f64 = 0.15;
 
 /// Height of the flames at time 0, without what range and box may be wrong by. `None` for fewer than
 /// four looks.
+///
+/// What depth and tip may be wrong by goes through the whole solution, to both sides: a low fire that is
+/// deep and a high one that is not look alike from above, and a little more depth makes much less height.
 #[must_use]
 pub fn height(
     looks: &[(f64, InMetres)],
     depth: &Measured,
     wind: Option<&Wind>,
 ) -> Option<Measured> {
+    let of = |depth_m: f64, tip_off: f64| both_ways(looks, depth_m, tip_off, wind);
+    let told = of(depth.value, 0.0)?;
+    let apart = |one: Option<Measured>, other: Option<Measured>| {
+        let off = |height: Option<Measured>| height.map_or(0.0, |h| (h.value - told.value).abs());
+        off(one).max(off(other))
+    };
+    let less_deep = (depth.value - depth.sigma).max(0.0);
+    let by_depth = apart(of(depth.value + depth.sigma, 0.0), of(less_deep, 0.0));
+    let by_tip = apart(of(depth.value, TIP_SIGMA), of(depth.value, -TIP_SIGMA));
+    Some(Measured {
+        sigma: told.sigma.hypot(by_depth).hypot(by_tip),
+        ..told
+    })
+}
+
+/// Height for one depth, and a share of it by which the tip stands farther than assumed. Where a low
+/// fire whose tip is far and a high one whose tip is near both fit, it is in between.
+fn both_ways(
+    looks: &[(f64, InMetres)],
+    depth_m: f64,
+    tip_off: f64,
+    wind: Option<&Wind>,
+) -> Option<Measured> {
+    let low = settled(looks, depth_m, tip_off, TIP_AT + TIP_FARTHER, wind)?;
+    let high = settled(looks, depth_m, tip_off, TIP_AT, wind)?;
+    Some(Measured {
+        value: (low.value + high.value) / 2.0,
+        sigma: low
+            .sigma
+            .max(high.sigma)
+            .hypot((high.value - low.value) / 2.0),
+    })
+}
+
+/// Height from a first share of the depth at which the tip stands.
+fn settled(
+    looks: &[(f64, InMetres)],
+    depth_m: f64,
+    tip_off: f64,
+    mut tip_share: f64,
+    wind: Option<&Wind>,
+) -> Option<Measured> {
     // How far the tallest tip stands from the near edge depends on the height itself.
-    let mut tip_share = TIP_AT + TIP_FARTHER;
     let mut height = None;
-    for _ in 0..3 {
-        let told = solve(looks, depth, tip_share, wind)?;
-        let flatness = depth.value / (depth.value + told.value);
+    for _ in 0..SETTLING {
+        let told = solve(looks, (tip_share + tip_off) * depth_m, wind)?;
+        let flatness = depth_m / (depth_m + told.value);
         tip_share = TIP_AT + TIP_FARTHER * flatness * flatness;
         height = Some(told);
     }
     height
 }
 
-/// Unknowns: height now, its change per second, lean towards east and north.
-fn solve(
-    looks: &[(f64, InMetres)],
-    depth: &Measured,
-    tip_share: f64,
-    wind: Option<&Wind>,
-) -> Option<Measured> {
+/// Unknowns: height now, its change per second, lean towards east and north. The tip stands `tip_m`
+/// behind the near edge.
+fn solve(looks: &[(f64, InMetres)], tip_m: f64, wind: Option<&Wind>) -> Option<Measured> {
     if looks.len() < 4 {
         return None;
     }
-    let raised = |look: &InMetres| look.apparent_height_m - tip_share * depth.value * look.slope;
+    let raised = |look: &InMetres| look.apparent_height_m - tip_m * look.slope;
     let apparent = median(looks.iter().map(|(_, look)| look.apparent_height_m));
     let least = (LEAST_SHARE * apparent).max(0.02);
     let guess = median(looks.iter().map(|(_, look)| raised(look))).max(least);
@@ -94,10 +136,11 @@ fn solve(
             .map(|(t_s, look)| raised(look) - by(*t_s, look).dot(&solved));
         noise = scatter(&left.collect::<Vec<f64>>()) + 1e-3;
     }
-    let by_depth = last.slope * (TIP_SIGMA * depth.value).hypot(tip_share * depth.sigma);
+    let value = solved[0].max(least);
     Some(Measured {
-        value: solved[0].max(least),
-        sigma: variance.max(0.0).sqrt().hypot(by_depth),
+        value,
+        // What had to be put right was told wrong.
+        sigma: variance.max(0.0).sqrt().hypot(value - solved[0]),
     })
 }
 
@@ -160,6 +203,31 @@ mod tests {
         let told = height(&boxes(), &depth, None).unwrap();
         assert!((told.value - 2.0).abs() < 0.1, "{told:?}");
         assert!((0.02..0.4).contains(&told.sigma), "{told:?}");
+    }
+
+    #[test]
+    fn a_depth_that_is_not_known_makes_a_height_that_is_not() {
+        // A running front from one side: 0.9 m high, 6 m deep, taken for as deep as it is wide.
+        let behind = (TIP_AT + TIP_FARTHER * 0.76) * 6.0;
+        let looks: Vec<(f64, InMetres)> = boxes()
+            .into_iter()
+            .map(|(t_s, look)| {
+                let look = InMetres {
+                    apparent_height_m: 0.9 + behind,
+                    slope: 1.0,
+                    sight: Vector2::y(),
+                    ..look
+                };
+                (t_s, look)
+            })
+            .collect();
+        let depth = Measured {
+            value: 3.6,
+            sigma: 1.4,
+        };
+        let told = height(&looks, &depth, None).unwrap();
+        assert!(told.sigma > 0.3 * told.value, "{told:?}");
+        assert!((told.value - 0.9).abs() < 2.5 * told.sigma, "{told:?}");
     }
 
     #[test]

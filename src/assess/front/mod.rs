@@ -13,7 +13,8 @@
 //! away, its back a share of that, its half width another. Both shares lie about those of Alexander
 //! (1985), where length over width gives the ratio of head to back; flanks may be narrower or wider.
 //! For each direction of the head and each pair of shares all else is linear and solved by weighted
-//! least squares; nodes are weighed by their evidence.
+//! least squares; about each, direction and shares are solved for as well. Nodes are weighed by
+//! their evidence.
 //!
 //! What moves all planes of a flight alike is not noise: heading, tilt and roll of the camera, the
 //! scale of a detector's boxes, the range, the lean of the flames. Each is a disturbance with a prior.
@@ -21,148 +22,16 @@
 //! flame's edge, which stays alike for some seconds. All of it is in the covariance of the planes, once
 //! for all nodes.
 
+mod nodes;
+mod oval;
+mod scene;
+
 use super::extent::{Measured, Standing, Wind};
 use super::outline::Look;
-use nalgebra::{Cholesky, DMatrix, DVector, Dyn, SMatrix, SVector, Vector2, Vector3};
-
-/// What is solved for at each node: place of ignition from the foot (east, north), distance of the
-/// head now, its speed, scale of the flames, its growth, what their half width differs by.
-const UNKNOWNS: usize = 7;
-const H: usize = 2;
-const V: usize = 3;
-const FLAME: usize = 4;
-const WIDER: usize = 6;
-type Unknowns = SVector<f64, UNKNOWNS>;
-
-/// Height, tilt and the like: what disturbs all looks alike. Heading, tilt, roll, scale of the boxes,
-/// range, near rim, lean (east, north).
-const DISTURBANCES: usize = 8;
-
-/// Half width of the flames on the rim against their height; at the near rim their feet are seen.
-const HALF_WIDTH: f64 = 0.3;
-const FOOT_SHARE: f64 = 0.6;
-/// One sigma of what that differs by, and of the near rim's, against the flames' height.
-const HALF_WIDTH_SIGMA: f64 = 0.25;
-const NEAR_SIGMA: f64 = 0.12;
-/// Height of the flames against the box's, which holds depth too, and its sigma as a share.
-const BOX_FLAME: f64 = 0.4;
-const FLAME_SIGMA: f64 = 0.5;
-/// One sigma of its growth per second, and of the lean, against it.
-const GROWTH: f64 = 0.02;
-const LEAN: f64 = 0.3;
-/// One sigma of a detector's scale for a flight; what it may be beyond that is in the speed's own share.
-const BOX_SCALE: f64 = 0.03;
-/// What differs from look to look: share of the flame's height and of the fire's width.
-const LICK: f64 = 0.06;
-const JITTER: f64 = 0.01;
-/// What stays alike for [`ALIKE_S`]: share of the flame's height.
-const SLOW: f64 = 0.06;
-const ALIKE_S: f64 = 5.0;
-/// Range in which the looks' own scatter may change the weight of a look.
-const WORTH: (f64, f64) = (0.1, 20.0);
-/// Prior of the speed, m/s.
-const SPEED_PRIOR: f64 = 3.0;
-
-/// Directions of the head.
-const HEADS: usize = 24;
-/// Length over width of the oval, and how likely it is beforehand: fires before a wind of some m/s
-/// are one and a half to two and a half times as long as wide.
-const LENGTHS: [(f64, f64); 6] = [
-    (1.1, 0.5),
-    (1.25, 1.0),
-    (1.5, 2.0),
-    (2.0, 2.0),
-    (2.7, 1.0),
-    (3.5, 0.5),
-];
-/// Flanks against Alexander's, and how likely that is.
-const FLANKS: [(f64, f64); 3] = [(0.7, 0.25), (1.0, 0.5), (1.4, 0.25)];
-/// How likely a round fire is beforehand.
-const ROUND: f64 = 2.0;
-
-/// Which edge of a box.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Edge {
-    Side,
-    OtherSide,
-    Near,
-    /// The tracker's own place of the near rim: not of a box.
-    Foot,
-}
-
-/// One plane that touches the fire, relative to the foot.
-#[derive(Debug, Clone, Copy)]
-struct Row {
-    t_s: f64,
-    edge: Edge,
-    normal: Vector3<f64>,
-    /// Horizontal part of the normal: its length and direction.
-    flat: f64,
-    outwards: Vector2<f64>,
-    /// Support of the body that the plane says, metres.
-    metres: f64,
-    to_fire: Vector3<f64>,
-    half_width_m: f64,
-    edge_m: f64,
-}
-
-/// An oval whose head is 1 away from the place of ignition.
-#[derive(Debug, Clone, Copy, PartialEq)]
-struct Oval {
-    head: Vector2<f64>,
-    back: f64,
-    flank: f64,
-}
-
-impl Oval {
-    const ROUND: Self = Self {
-        head: Vector2::new(0.0, 1.0),
-        back: 1.0,
-        flank: 1.0,
-    };
-
-    /// Alexander's, of a length over width, with flanks of a share of his.
-    fn of(head: Vector2<f64>, length: f64, flanks: f64) -> Self {
-        let root = (length * length - 1.0).max(0.0).sqrt();
-        let back = (length - root) / (length + root);
-        Self {
-            head,
-            back,
-            flank: flanks * (1.0 + back) / 2.0 / length,
-        }
-    }
-
-    /// Support function.
-    fn reach(&self, outwards: &Vector2<f64>) -> f64 {
-        let (along, across) = (self.head.dot(outwards), self.head.perp(outwards));
-        let half = (1.0 + self.back) / 2.0;
-        (1.0 - self.back) / 2.0 * along + (half * along).hypot(self.flank * across)
-    }
-
-    /// A point of the rim and its outward direction.
-    fn rim(&self, angle: f64) -> (Vector2<f64>, Vector2<f64>) {
-        let left = Vector2::new(-self.head.y, self.head.x);
-        let (half, middle) = ((1.0 + self.back) / 2.0, (1.0 - self.back) / 2.0);
-        let (sin, cos) = angle.sin_cos();
-        let place = self.head * (middle + half * cos) + left * (self.flank * sin);
-        let outwards = self.head * (self.flank * cos) + left * (half * sin);
-        (place, outwards.normalize())
-    }
-
-    /// How much it points: 0 for a round fire, towards 1 for one that runs one way.
-    fn points(&self) -> f64 {
-        (1.0 - self.back) / (1.0 + self.back)
-    }
-}
-
-/// One node of the grid: an oval, and what follows for it.
-#[derive(Debug, Clone, Copy)]
-struct Node {
-    oval: Oval,
-    solved: Unknowns,
-    covariance: SMatrix<f64, UNKNOWNS, UNKNOWNS>,
-    weight: f64,
-}
+use nalgebra::{SMatrix, Vector2};
+use nodes::{FLAME, H, Node, TURN, UNKNOWNS, Unknowns, V, WIDER, nodes, weighed};
+use oval::Oval;
+use scene::{HALF_WIDTH, Scene, WORTH};
 
 /// What the looks say about the oval.
 #[derive(Debug, Clone)]
@@ -171,303 +40,13 @@ pub(super) struct Shape {
     used_wind: bool,
 }
 
-/// What the rows are wrong by, factored; and the columns that all nodes share, whitened.
-struct Doubt {
-    cholesky: Cholesky<f64, Dyn>,
-    seen: DVector<f64>,
-    shared: DMatrix<f64>,
-    prior: Unknowns,
-    prior_mean: Unknowns,
-}
-
-/// The looks as rows, and the scales that doubts go with.
-struct Scene<'a> {
-    rows: Vec<Row>,
-    standing: &'a Standing,
-    /// From the latest camera to the foot.
-    sight: Vector3<f64>,
-    flame_m: f64,
-}
-
-impl<'a> Scene<'a> {
-    fn new(looks: &[(f64, &Look)], standing: &'a Standing) -> Option<Self> {
-        let (_, last) = looks.last()?;
-        let sight = standing.foot - last.camera();
-        let mut heights: Vec<f64> = looks
-            .iter()
-            .map(|(_, look)| look.box_height_m(&standing.foot))
-            .collect();
-        heights.sort_by(f64::total_cmp);
-        let mut rows: Vec<Row> = looks
-            .iter()
-            .flat_map(|(t_s, look)| rows_of(*t_s, look, &standing.foot))
-            .collect();
-        rows.push(foot_row(&sight)?);
-        Some(Self {
-            rows,
-            standing,
-            sight,
-            flame_m: (BOX_FLAME * heights.get(heights.len() / 2)?).max(0.02),
-        })
-    }
-
-    /// What a unit of each disturbance does to a row, times its sigma.
-    fn disturbed(&self, row: &Row) -> SVector<f64, DISTURBANCES> {
-        let (heading, tilt) = self.standing.turn_rad;
-        let flat_m = self.sight.xy().norm();
-        if row.edge == Edge::Foot {
-            let range = -flat_m * self.standing.range_share;
-            let near = NEAR_SIGMA * self.flame_m;
-            return SVector::from([0.0, 0.0, 0.0, 0.0, range, near, 0.0, 0.0]);
-        }
-        let ahead = row.to_fire.xy().normalize();
-        let ahead = Vector3::new(ahead.x, ahead.y, 0.0);
-        let right = ahead.cross(&Vector3::z());
-        let turned = |axis: Vector3<f64>| axis.cross(&row.normal).dot(&row.to_fire);
-        let near = f64::from(u8::from(row.edge == Edge::Near));
-        let lean = LEAN * self.flame_m * 0.5 * (1.0 - near);
-        SVector::from([
-            heading * turned(Vector3::z()),
-            tilt * turned(right),
-            tilt * turned(ahead),
-            BOX_SCALE * row.half_width_m * (1.0 - near),
-            -self.standing.range_share * row.normal.z * self.sight.z,
-            NEAR_SIGMA * self.flame_m * near * row.flat,
-            lean * row.normal.x,
-            lean * row.normal.y,
-        ])
-    }
-
-    /// Covariance of two rows, without what is each one's own.
-    fn covariance(&self, a: &Row, b: &Row) -> f64 {
-        if a.edge == Edge::Foot || b.edge == Edge::Foot {
-            return 0.0;
-        }
-        let (across, up) = self.standing.wander_m;
-        let flat = a.normal.xy().dot(&b.normal.xy()) * across * across;
-        let walked = a.t_s.abs().min(b.t_s.abs()) * (flat + a.normal.z * b.normal.z * up * up);
-        let slow = (SLOW * self.flame_m).powi(2);
-        let alike = (-(a.t_s - b.t_s).abs() / ALIKE_S).exp() * slow;
-        walked + if a.edge == b.edge { alike } else { 0.0 }
-    }
-
-    /// Variance of what differs from look to look.
-    fn own(&self, row: &Row, worth: f64) -> f64 {
-        if row.edge == Edge::Foot {
-            return (0.1 * self.flame_m + 0.05).powi(2);
-        }
-        let jitter = 2.0 * JITTER * row.half_width_m;
-        let lick = LICK * self.flame_m;
-        (row.edge_m.powi(2) + lick.powi(2) + jitter.powi(2)) / worth
-    }
-
-    fn doubt(&self, worth: f64) -> Option<Doubt> {
-        let n = self.rows.len();
-        let by: Vec<SVector<f64, DISTURBANCES>> =
-            self.rows.iter().map(|row| self.disturbed(row)).collect();
-        let covariance = DMatrix::from_fn(n, n, |i, j| {
-            let (a, b) = (&self.rows[i], &self.rows[j]);
-            let own = if i == j { self.own(a, worth) } else { 0.0 };
-            by[i].dot(&by[j]) + self.covariance(a, b) + own
-        });
-        let cholesky = Cholesky::new(covariance)?;
-        let lower = cholesky.l();
-        let seen = DVector::from_iterator(n, self.rows.iter().map(|row| row.metres));
-        let columns: Vec<[f64; 5]> = self.rows.iter().map(shared_columns).collect();
-        let shared = DMatrix::from_fn(n, 5, |i, k| columns[i][k]);
-        let (flame, range_m) = (self.flame_m, self.sight.norm());
-        let sigmas = [
-            range_m,
-            range_m,
-            range_m,
-            SPEED_PRIOR,
-            FLAME_SIGMA * flame,
-            GROWTH * flame,
-            HALF_WIDTH_SIGMA * flame,
-        ];
-        let mut prior_mean = Unknowns::zeros();
-        prior_mean[FLAME] = flame;
-        Some(Doubt {
-            seen: lower.solve_lower_triangular(&seen)?,
-            shared: lower.solve_lower_triangular(&shared)?,
-            cholesky,
-            prior: SVector::from(sigmas.map(|sigma: f64| sigma.powi(-2))),
-            prior_mean,
-        })
-    }
-
-    fn nodes(&self, worth: f64, wind: Option<&Wind>) -> Option<Vec<(f64, Node)>> {
-        let doubt = self.doubt(worth)?;
-        let grid = grid();
-        // Two columns a node: over H and over V.
-        let n = self.rows.len();
-        let mut columns = DMatrix::zeros(n, 2 * grid.len());
-        for (k, (oval, _)) in grid.iter().enumerate() {
-            for (i, row) in self.rows.iter().enumerate() {
-                let reach = row.flat * oval.reach(&row.outwards);
-                columns[(i, 2 * k)] = reach;
-                columns[(i, 2 * k + 1)] = reach * row.t_s;
-            }
-        }
-        let own = doubt.cholesky.l().solve_lower_triangular(&columns)?;
-        let mut nodes = Vec::with_capacity(grid.len());
-        for (k, (oval, likely)) in grid.iter().enumerate() {
-            let solved = doubt.solve(&own.columns(2 * k, 2).into_owned(), *oval);
-            nodes.extend(solved.map(|(misfit, mut node)| {
-                node.weight += likely.ln() + downwind(oval, wind);
-                (misfit, node)
-            }));
-        }
-        Some(nodes)
-    }
-}
-
-impl Doubt {
-    /// Misfit and node for one oval, whose two columns are given whitened.
-    fn solve(&self, own: &DMatrix<f64>, oval: Oval) -> Option<(f64, Node)> {
-        let column = |k: usize| match k {
-            H => own.column(0),
-            V => own.column(1),
-            0 | 1 => self.shared.column(k),
-            _ => self.shared.column(k - 2),
-        };
-        let mut information = SMatrix::from_diagonal(&self.prior);
-        let mut right = self.prior.component_mul(&self.prior_mean);
-        for i in 0..UNKNOWNS {
-            right[i] += column(i).dot(&self.seen);
-            for j in 0..=i {
-                let product = column(i).dot(&column(j));
-                information[(i, j)] += product;
-                if i != j {
-                    information[(j, i)] += product;
-                }
-            }
-        }
-        let cholesky = information.cholesky()?;
-        let solved: Unknowns = cholesky.solve(&right);
-        let log_determinant: f64 = cholesky.l().diagonal().iter().map(|d| 2.0 * d.ln()).sum();
-        let expected = self
-            .prior
-            .dot(&self.prior_mean.component_mul(&self.prior_mean));
-        let misfit = self.seen.norm_squared() + expected - solved.dot(&right);
-        let backwards = solved[H] < 0.0 && oval.back < 1.0;
-        (!backwards).then(|| {
-            let node = Node {
-                oval,
-                solved,
-                covariance: cholesky.inverse(),
-                weight: -0.5 * (misfit + log_determinant),
-            };
-            (misfit, node)
-        })
-    }
-}
-
-/// The planes of one look that say something of the ground.
-fn rows_of(t_s: f64, look: &Look, foot: &Vector3<f64>) -> Vec<Row> {
-    let to_fire = foot - look.camera();
-    let half_width_m = look.half_width_m(foot);
-    let row = |edge: Edge, normal: Vector3<f64>| {
-        let flat = normal.xy().norm();
-        // Straight down, the near edge is no edge on the ground.
-        (flat > 0.2 && to_fire.xy().norm() > 0.5).then(|| Row {
-            t_s,
-            edge,
-            normal,
-            flat,
-            outwards: normal.xy() / flat,
-            metres: -normal.dot(&to_fire),
-            to_fire,
-            half_width_m,
-            edge_m: to_fire.norm() * look.edge_rad,
-        })
-    };
-    let [left, right, near] = look.planes();
-    let rows = [
-        row(Edge::Side, left),
-        row(Edge::OtherSide, right),
-        row(Edge::Near, near),
-    ];
-    rows.into_iter().flatten().collect()
-}
-
-/// The near rim as the tracker has it.
-fn foot_row(sight: &Vector3<f64>) -> Option<Row> {
-    let towards = -sight.xy().try_normalize(1e-3)?;
-    Some(Row {
-        t_s: 0.0,
-        edge: Edge::Foot,
-        normal: Vector3::new(towards.x, towards.y, 0.0),
-        flat: 1.0,
-        outwards: towards,
-        metres: 0.0,
-        to_fire: *sight,
-        half_width_m: 0.0,
-        edge_m: 0.0,
-    })
-}
-
-/// A row over place, flames, their growth and their half width.
-fn shared_columns(row: &Row) -> [f64; 5] {
-    let flame = match row.edge {
-        Edge::Side | Edge::OtherSide => 0.5 * row.normal.z + HALF_WIDTH * row.flat,
-        Edge::Near | Edge::Foot => FOOT_SHARE * HALF_WIDTH * row.flat,
-    };
-    [row.normal.x, row.normal.y, flame, flame * row.t_s, row.flat]
-}
-
-/// All ovals, and how likely each is beforehand.
-fn grid() -> Vec<(Oval, f64)> {
-    let mut grid = vec![(Oval::ROUND, ROUND * HEADS as f64)];
-    for k in 0..HEADS {
-        let azimuth = std::f64::consts::TAU * k as f64 / HEADS as f64;
-        let head = Vector2::new(azimuth.sin(), azimuth.cos());
-        for (length, likely) in LENGTHS {
-            grid.extend(
-                FLANKS.map(|(flanks, share)| (Oval::of(head, length, flanks), likely * share)),
-            );
-        }
-    }
-    grid
-}
-
-/// Log of the prior: fires run before the wind, the surer the stronger it blows.
-fn downwind(oval: &Oval, wind: Option<&Wind>) -> f64 {
-    let Some(wind) = wind else {
-        return 0.0;
-    };
-    let speed = wind.towards_m_s.norm();
-    if speed < 1e-6 {
-        return 0.0;
-    }
-    let doubt = (wind.sigma_m_s / speed).hypot(0.6);
-    let (along, across) = (
-        oval.head.dot(&wind.towards_m_s),
-        oval.head.perp(&wind.towards_m_s),
-    );
-    // A round fire has no head.
-    -0.5 * (across.atan2(along) / doubt).powi(2) * (1.0 - oval.back).max(0.0).sqrt()
-}
-
-/// The same with weights that sum to 1; nodes that don't matter are left out.
-fn weighed(nodes: Vec<(f64, Node)>) -> Vec<Node> {
-    let best = nodes
-        .iter()
-        .map(|(_, node)| node.weight)
-        .fold(f64::MIN, f64::max);
-    let weights: Vec<f64> = nodes
-        .iter()
-        .map(|(_, node)| (node.weight - best).exp())
-        .collect();
-    let total: f64 = weights.iter().sum();
-    let nodes = nodes
-        .into_iter()
-        .zip(weights)
-        .map(|((_, node), weight)| Node {
-            weight: weight / total,
-            ..node
-        });
-    nodes.filter(|node| node.weight > 1e-6).collect()
+/// Where the head runs.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Heading {
+    /// Clockwise from north, with one sigma, degrees.
+    pub azimuth_deg: Measured,
+    /// Probability that it runs to the other side: more than a right angle off.
+    pub backwards: f64,
 }
 
 impl Shape {
@@ -478,14 +57,12 @@ impl Shape {
         wind: Option<&Wind>,
     ) -> Option<Self> {
         let scene = Scene::new(looks, standing)?;
-        let first = scene.nodes(1.0, wind)?;
-        let best = first
-            .iter()
-            .max_by(|a, b| a.1.weight.total_cmp(&b.1.weight))?;
+        let first = nodes(&scene, 1.0, wind)?;
+        let best = first.iter().max_by(|a, b| a.weight.total_cmp(&b.weight))?;
         // The looks' own scatter about the best oval says how much each of them is worth.
         let freedom = (scene.rows.len() as f64 - UNKNOWNS as f64).max(1.0);
-        let worth = (freedom / best.0.max(1e-9)).clamp(WORTH.0, WORTH.1);
-        let nodes = weighed(scene.nodes(worth, wind)?);
+        let worth = (freedom / best.misfit.max(1e-9)).clamp(WORTH.0, WORTH.1);
+        let nodes = weighed(nodes(&scene, worth, wind)?);
         (!nodes.is_empty()).then_some(Self {
             nodes,
             used_wind: wind.is_some(),
@@ -510,6 +87,7 @@ impl Shape {
                 solved,
                 covariance,
                 weight: 1.0,
+                misfit: 0.0,
             }],
             used_wind: false,
         }
@@ -574,22 +152,28 @@ impl Shape {
         self.measured(place).sigma
     }
 
-    /// Circular mean and deviation of the head, each node by how much it points; `None` for what
-    /// points nowhere.
-    pub(super) fn azimuth_deg(&self) -> Option<Measured> {
+    /// Circular mean and deviation of the head over the nodes, each by how much it points, with what each
+    /// is wrong by itself; `None` for what points nowhere.
+    pub(super) fn heading(&self) -> Option<Heading> {
         let total = self.mean(|node| node.oval.points());
         if total <= 1e-9 {
             return None;
         }
-        let pulled = self.nodes.iter();
-        let mean: Vector2<f64> = pulled
-            .map(|node| node.oval.head * (node.weight * node.oval.points() / total))
+        let share = |node: &Node| node.weight * node.oval.points() / total;
+        let nodes = self.nodes.iter();
+        // A normal error of so many radians shortens the mean direction (von Mises).
+        let mean: Vector2<f64> = nodes
+            .clone()
+            .map(|node| node.oval.head * share(node) * (-0.5 * node.covariance[(TURN, TURN)]).exp())
             .sum();
         let length = mean.norm().clamp(1e-6, 1.0 - 1e-9);
-        let grid_rad = std::f64::consts::TAU / HEADS as f64 / 12.0_f64.sqrt();
-        Some(Measured {
-            value: mean.x.atan2(mean.y).to_degrees().rem_euclid(360.0),
-            sigma: (-2.0 * length.ln()).sqrt().hypot(grid_rad).to_degrees(),
+        let opposite = nodes.filter(|node| node.oval.head.dot(&mean) < 0.0);
+        Some(Heading {
+            azimuth_deg: Measured {
+                value: mean.x.atan2(mean.y).to_degrees().rem_euclid(360.0),
+                sigma: (-2.0 * length.ln()).sqrt().to_degrees(),
+            },
+            backwards: opposite.map(share).sum(),
         })
     }
 
@@ -624,7 +208,7 @@ impl Shape {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use emberfix_frames::{ServiceTime, seconds};
+    use emberfix_frames::{ServiceTime, Vector3, seconds};
 
     const FLAME_M: f64 = 1.5;
 
@@ -706,7 +290,7 @@ mod tests {
         let azimuth = 70_f64.to_radians();
         let oval = Oval::of(Vector2::new(azimuth.sin(), azimuth.cos()), 1.7, 1.1);
         let shape = fitted(&oval, 0.3);
-        let (speed, head) = (shape.speed_m_s(), shape.azimuth_deg().unwrap());
+        let (speed, head) = (shape.speed_m_s(), shape.heading().unwrap().azimuth_deg);
         assert!((speed.value / 0.3 - 1.0).abs() < 0.12, "{speed:?}");
         assert!(
             (speed.value - 0.3).abs() < 2.5 * speed.sigma + 0.02,
@@ -719,24 +303,32 @@ mod tests {
     }
 
     #[test]
+    fn an_oval_between_the_cells_of_the_grid_is_found_and_not_told_backwards() {
+        for azimuth_deg in [7.5_f64, 97.5, 202.5, 292.5] {
+            let azimuth = azimuth_deg.to_radians();
+            let head = Vector2::new(azimuth.sin(), azimuth.cos());
+            let shape = fitted(&Oval::of(head, 1.75, 1.18), 0.3);
+            let heading = shape.heading().unwrap();
+            let off = (heading.azimuth_deg.value - azimuth_deg + 540.0).rem_euclid(360.0) - 180.0;
+            assert!(off.abs() < 5.0, "{azimuth_deg}: {heading:?}");
+            assert!(
+                heading.azimuth_deg.sigma < 15.0,
+                "{azimuth_deg}: {heading:?}"
+            );
+            assert!(heading.backwards < 1e-3, "{azimuth_deg}: {heading:?}");
+        }
+    }
+
+    #[test]
     fn a_fire_that_stands_is_slow_and_one_that_grows_all_around_points_nowhere() {
         let oval = Oval::of(Vector2::x(), 1.7, 1.0);
         let speed = fitted(&oval, 0.0).speed_m_s();
         assert!(speed.value.abs() < 0.03, "{speed:?}");
         let round = fitted(&Oval::ROUND, 0.2);
-        let head = round.azimuth_deg();
-        assert!(head.is_none_or(|head| head.sigma > 20.0), "{head:?}");
-    }
-
-    #[test]
-    fn corners_lie_on_the_oval_and_the_head_is_the_fastest() {
-        let oval = Oval::of(Vector2::x(), 1.5, 1.0);
-        for k in 0..24 {
-            let (rim, outwards) = oval.rim(f64::from(k) * 0.26);
-            assert!((rim.dot(&outwards) - oval.reach(&outwards)).abs() < 1e-9);
-            assert!(oval.reach(&outwards) <= 1.0 + 1e-9);
-        }
-        assert!((oval.reach(&Vector2::x()) - 1.0).abs() < 1e-9);
-        assert!((oval.reach(&-Vector2::x()) - oval.back).abs() < 1e-9);
+        let head = round.heading();
+        assert!(
+            head.is_none_or(|head| head.azimuth_deg.sigma > 20.0),
+            "{head:?}"
+        );
     }
 }
