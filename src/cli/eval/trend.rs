@@ -19,7 +19,7 @@ pub struct TrendArguments {
     #[arg(long, value_enum, default_value = "both")]
     set: Set,
     /// Rendered flights for size and spread; 0 leaves them out.
-    #[arg(long, default_value_t = 400)]
+    #[arg(long, default_value_t = 800)]
     flights: usize,
     /// The first noise model and 60 flights only: a minute or two.
     #[arg(long)]

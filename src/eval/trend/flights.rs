@@ -87,8 +87,8 @@ pub struct Outcome {
     pub height: Pair,
     /// Whether it runs.
     pub runs: bool,
-    /// Whether the flight circled it, or stayed on one side.
-    pub circled: bool,
+    /// Degrees of a circle about it from which it was seen.
+    pub view_deg: f64,
     /// m/s and degrees, where a running fire was told as one.
     pub speed: Option<Pair>,
     /// Degrees; the truth is written within half a turn of what was told.
@@ -432,7 +432,7 @@ impl Outcome {
             width: pair(extent.width_m, width),
             height: pair(extent.height_m, height),
             runs: truth.spread.is_some(),
-            circled: scene.turn_rad_s.abs() > 0.015,
+            view_deg: (scene.turn_rad_s.abs() * FLIGHT_S).to_degrees(),
             speed: told.map(|(told, truth)| pair(told.speed_m_s, truth.speed_m_s)),
             azimuth,
             false_spread: truth.spread.is_none() && extent.spread.is_some(),

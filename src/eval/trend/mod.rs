@@ -11,6 +11,7 @@ mod coverage;
 pub mod flights;
 pub mod score;
 
+use crate::assess::extent::{KNOWN, LEAST_HEAD_DEG};
 use crate::eval::{Report, Table};
 use contest::{BURNS, Contest, GROUPS};
 use emberfix_calib::Rig;
@@ -31,6 +32,8 @@ pub struct Options {
     pub flights: usize,
 }
 
+/// Ranges that are told apart, metres.
+const BANDS: [(f64, f64); 3] = [(10.0, 20.0), (20.0, 50.0), (50.0, 100.0)];
 /// Seeds that the flights come from.
 pub const FLIGHT_SEEDS: usize = 2;
 
@@ -84,6 +87,7 @@ pub fn measure(
     }
     if !flown.is_empty() {
         tables.push(flight_table(&flown));
+        tables.push(spread_table(&flown));
         tables.push(coverage::table(&interval_rows(&flown)));
         plots.push(("trend_size_and_spread".to_owned(), flight_sheet(&flown)));
     }
@@ -149,17 +153,17 @@ fn second_figures(contest: &Contest) -> Vec<Figure> {
     ]
 }
 
-/// A height whose own sigma is a greater share than this is told as unknown: from above, a deep
-/// fire's flames can't be told from its far side.
-const MEASURED: f64 = 0.3;
+/// A height that claims to be known.
+fn known_height(outcome: &Outcome) -> Option<Pair> {
+    Some(outcome.height).filter(|height| height.sigma <= KNOWN * height.told)
+}
 
-/// All widths, and the heights that claim to be measured.
+/// All widths, and the heights that claim to be known.
 fn sizes(flown: &[Outcome]) -> Vec<Pair> {
-    let measured = |outcome: &Outcome| {
-        Some(outcome.height).filter(|height| height.sigma <= MEASURED * height.told)
-    };
     let widths = flown.iter().map(|outcome| outcome.width);
-    widths.chain(flown.iter().filter_map(measured)).collect()
+    widths
+        .chain(flown.iter().filter_map(known_height))
+        .collect()
 }
 
 /// All widths and all heights.
@@ -175,6 +179,11 @@ fn flight_figures(flown: &[Outcome]) -> Vec<Figure> {
     let speeds: Vec<Pair> = flown.iter().filter_map(|outcome| outcome.speed).collect();
     let azimuths: Vec<Pair> = flown.iter().filter_map(|outcome| outcome.azimuth).collect();
     let running = flown.iter().filter(|outcome| outcome.runs).count();
+    let wide = flown
+        .iter()
+        .filter(|outcome| outcome.runs && is_wide(outcome))
+        .count();
+    let backwards = azimuths.iter().filter(|pair| is_backwards(pair)).count();
     let still = flown.len() - running;
     let wrongly = flown.iter().filter(|outcome| outcome.false_spread).count();
     let share = |count: usize, of: usize| (of > 0).then(|| count as f64 / of as f64);
@@ -200,7 +209,7 @@ fn flight_figures(flown: &[Outcome]) -> Vec<Figure> {
         ),
         coverage("size.coverage90", &sides(flown)),
         Figure::told(
-            "size.heights_measured_share",
+            "size.heights_known_share",
             share(sizes.len() - flown.len(), flown.len()),
             "",
             flown.len(),
@@ -220,14 +229,94 @@ fn flight_figures(flown: &[Outcome]) -> Vec<Figure> {
             azimuths.len(),
         ),
         coverage("spread.coverage90", &[speeds.clone(), azimuths].concat()),
+        Figure::told("spread.told", Some(speeds.len() as f64), "fires", running),
+        Figure::told(
+            "spread.withheld",
+            Some((running - speeds.len()) as f64),
+            "fires",
+            running,
+        ),
         Figure::told(
             "spread.told_share",
             share(speeds.len(), running),
             "",
             running,
         ),
+        Figure::told(
+            "spread.told_share_wide_view",
+            share(speeds.len(), wide),
+            "",
+            wide,
+        ),
+        Figure::told(
+            "spread.told_backwards",
+            Some(backwards as f64),
+            "fires",
+            speeds.len(),
+        ),
         Figure::told("spread.false_share", share(wrongly, still), "", still),
     ]
+}
+
+/// Whether a fire was seen from so many sides that a head may be told at all.
+fn is_wide(outcome: &Outcome) -> bool {
+    outcome.view_deg >= LEAST_HEAD_DEG
+}
+
+/// Told to run to the other side.
+fn is_backwards(azimuth: &Pair) -> bool {
+    (azimuth.told - azimuth.truth).abs() > 90.0
+}
+
+/// How many heads are told and withheld, and why.
+fn spread_table(flown: &[Outcome]) -> Table {
+    let row = |(name, inside): (String, Vec<&Outcome>)| {
+        let count = |of: &dyn Fn(&Outcome) -> bool| {
+            let counted = inside.iter().filter(|outcome| of(outcome));
+            counted.count().to_string()
+        };
+        let withheld = |outcome: &Outcome| outcome.runs && outcome.speed.is_none();
+        vec![
+            name,
+            count(&|outcome| outcome.runs),
+            count(&|outcome| outcome.speed.is_some()),
+            count(&|outcome| withheld(outcome) && !is_wide(outcome)),
+            count(&|outcome| withheld(outcome) && is_wide(outcome)),
+            count(&|outcome| outcome.azimuth.as_ref().is_some_and(is_backwards)),
+            count(&|outcome| !outcome.runs),
+            count(&|outcome| outcome.false_spread),
+            count(&|outcome| known_height(outcome).is_some()),
+        ]
+    };
+    let inside = |low: f64, high: f64| {
+        let inside = flown
+            .iter()
+            .filter(|outcome| (low..high).contains(&outcome.range_m));
+        (format!("{low:.0} to {high:.0} m"), inside.collect())
+    };
+    let mut kinds: Vec<(String, Vec<&Outcome>)> = BANDS
+        .iter()
+        .map(|(low, high)| inside(*low, *high))
+        .collect();
+    kinds.push(("all".to_owned(), flown.iter().collect()));
+    let header = [
+        "range",
+        "run",
+        "told",
+        "withheld: seen from one side",
+        "withheld: not sure",
+        "told backwards",
+        "stand",
+        "told to run",
+        "heights known",
+    ];
+    Table {
+        title: format!(
+            "Fires whose head is told and withheld; one side is less than {LEAST_HEAD_DEG:.0} degrees of view"
+        ),
+        header: header.map(str::to_owned).to_vec(),
+        rows: kinds.into_iter().map(row).collect(),
+    }
 }
 
 /// What the 90 % intervals are counted over.
@@ -247,12 +336,11 @@ fn rms(pairs: &[Pair], of: impl Fn(&Pair) -> f64) -> Option<f64> {
 }
 
 fn flight_table(flown: &[Outcome]) -> Table {
-    let bands = [(10.0, 20.0), (20.0, 50.0), (50.0, 100.0)];
     let percent = |pairs: &[Pair]| {
         rms(pairs, |p| 100.0 * p.share()).map_or("-".to_owned(), |value| format!("{value:.1}"))
     };
     let seeds: BTreeSet<u64> = flown.iter().map(|outcome| outcome.seed).collect();
-    let mut kinds: Vec<(String, Vec<Outcome>)> = bands
+    let mut kinds: Vec<(String, Vec<Outcome>)> = BANDS
         .map(|(low, high)| {
             let inside = flown
                 .iter()
@@ -299,29 +387,40 @@ fn flight_table(flown: &[Outcome]) -> Table {
 }
 
 fn flight_sheet(flown: &[Outcome]) -> Sheet {
-    let chart = |title: &str, unit: &str, pick: fn(&Outcome) -> Option<Pair>| {
-        let pairs: Vec<Pair> = flown.iter().filter_map(pick).collect();
-        let points = pairs.iter().map(|pair| (pair.truth, pair.told)).collect();
+    let points = |pairs: &[Pair]| pairs.iter().map(|pair| (pair.truth, pair.told)).collect();
+    let chart = |title: &str, unit: &str, pairs: &[Pair]| {
         let most = pairs.iter().map(|pair| pair.truth).fold(0.0, f64::max);
         let least = pairs.iter().map(|pair| pair.truth).fold(most, f64::min);
+        let equal = vec![(least, least), (most, most)];
         Chart::new(
             title,
             Axis::linear(format!("truth, {unit}")),
             Axis::linear(format!("told, {unit}")),
         )
-        .with(Series::new("", Mark::Dots, points))
-        .with(Series::new(
-            "equal",
-            Mark::Dashed,
-            vec![(least, least), (most, most)],
-        ))
+        .with(Series::new("equal", Mark::Dashed, equal))
     };
+    let dotted = |title: &str, unit: &str, pick: fn(&Outcome) -> Option<Pair>| {
+        let pairs: Vec<Pair> = flown.iter().filter_map(pick).collect();
+        chart(title, unit, &pairs).with(Series::new("told", Mark::Dots, points(&pairs)))
+    };
+    let (known, unknown): (Vec<&Outcome>, Vec<&Outcome>) = flown
+        .iter()
+        .partition(|outcome| known_height(outcome).is_some());
+    let heights =
+        |of: &[&Outcome]| -> Vec<Pair> { of.iter().map(|outcome| outcome.height).collect() };
+    let all: Vec<Pair> = flown.iter().map(|outcome| outcome.height).collect();
     Sheet {
         charts: vec![
-            chart("Width", "m", |outcome| Some(outcome.width)),
-            chart("Height", "m", |outcome| Some(outcome.height)),
-            chart("Speed of the head", "m/s", |outcome| outcome.speed),
-            chart("Direction of the head", "deg", |outcome| outcome.azimuth),
+            dotted("Width", "m", |outcome| Some(outcome.width)),
+            chart("Height", "m", &all)
+                .with(Series::new("known", Mark::Dots, points(&heights(&known))))
+                .with(Series::new(
+                    "told as not known",
+                    Mark::Dots,
+                    points(&heights(&unknown)),
+                )),
+            dotted("Speed of the head", "m/s", |outcome| outcome.speed),
+            dotted("Direction of the head", "deg", |outcome| outcome.azimuth),
         ],
         columns: 2,
     }
