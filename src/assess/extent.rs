@@ -10,6 +10,8 @@
 //! time: a range that gets better does not look like growth.
 //!
 //! **Known limits.** One head per fire. A sharp turn of the front is averaged over [`WINDOW_S`].
+//! Within 20 m, a front moves in that time about as far as a reported camera wanders: few heads are told
+//! there, most of them with the wind's help.
 
 use super::front::Shape;
 use super::outline::{InMetres, Look};
