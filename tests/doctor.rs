@@ -15,6 +15,7 @@ mod station;
 )]
 mod support;
 
+use clients::Running;
 use serde_json::Value;
 use sha2::{Digest as _, Sha256};
 use station::Station;
@@ -143,4 +144,29 @@ fn a_ground_station_lets_in_who_has_its_token_and_tells_others_what_to_do() {
     assert_eq!(said.code, 2, "{}", said.err);
     let words = said.out.split_whitespace().collect::<Vec<_>>().join(" ");
     assert!(words.contains("ask by https://"), "{words}");
+}
+
+/// Nothing but a key says who sends a datagram from elsewhere; whoever forgot it must not wonder for days
+/// why alarms are slow on a bad link.
+#[test]
+fn a_ground_beyond_this_computer_without_any_aircrafts_key_says_that_it_takes_no_datagrams() {
+    let scratch = Scratch::new();
+    let paper = rcgen::generate_simple_self_signed(["localhost".to_owned()]).unwrap();
+    scratch.write("ground.crt", paper.cert.pem());
+    scratch.write("ground.key", paper.signing_key.serialize_pem());
+    let config = format!(
+        "listen = \"0.0.0.0:0\"\ndata_dir = \"data\"\n\
+         [tls]\ncertificate = \"ground.crt\"\nkey = \"ground.key\"\n\
+         [[access]]\nname = \"uav-1\"\nrole = \"aircraft\"\ntoken_sha256 = \"{}\"\n",
+        "0".repeat(64)
+    );
+    let mut command = emberfix();
+    command
+        .arg("ground")
+        .arg(scratch.write("ground.toml", config));
+    let (_ground, line) = Running::start(command, "no datagrams");
+    assert!(
+        line.contains("public_key") && line.contains("emberfix keys"),
+        "{line}"
+    );
 }
