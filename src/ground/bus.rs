@@ -45,6 +45,9 @@ const PAUSE: Duration = Duration::from_millis(500);
 const COMPLETENESS: &str = "Emberfix-Completeness";
 /// Messages that are taken at once.
 const AT_ONCE: usize = 512;
+/// How often the server says that it has nothing; by its silence a station notices that it went away and
+/// came back without remembering that we wait.
+const HEARTBEAT: Duration = Duration::from_secs(1);
 /// After this time an unacknowledged message comes again.
 const ACK_WAIT: Duration = Duration::from_secs(10);
 
@@ -354,6 +357,8 @@ async fn consume(station: &Arc<Station>, config: &BusConfig) -> Result<(), BusEr
         .await
         .map_err(nats("opens its consumer"))?;
     let mut messages = consumer
+        .stream()
+        .heartbeat(HEARTBEAT)
         .messages()
         .await
         .map_err(nats("asks for messages"))?;

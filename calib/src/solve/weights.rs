@@ -81,7 +81,10 @@ impl Weights {
         for (at, view) in of.views.iter().enumerate() {
             let variance = inverse(&view.own)?.diagonal();
             let part = Steps::of_view(self, state, at, |index| variance[STEP + index]);
-            of_view.push(part.distance.map(|distance| (FREEDOM + PARTS) / (FREEDOM + distance)));
+            of_view.push(
+                part.distance
+                    .map(|distance| (FREEDOM + PARTS) / (FREEDOM + distance)),
+            );
             steps.add(&part);
         }
         let mut next = Self {

@@ -251,7 +251,11 @@ async fn run(
 
 async fn connect(url: &str) -> Result<jetstream::Context, LoadError> {
     let client = async_nats::ConnectOptions::new()
-        .reconnect_delay_callback(|_| Duration::from_millis(200))
+        // Its first attempt waits as well.
+        .reconnect_delay_callback(|attempts| match attempts {
+            0 | 1 => Duration::ZERO,
+            _ => Duration::from_millis(200),
+        })
         .connect(url)
         .await
         .map_err(|source| LoadError::Bus {
