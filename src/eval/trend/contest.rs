@@ -138,7 +138,7 @@ impl Contest {
             "Trend accuracy per group",
             Axis::linear("group"),
             // Room for the legend.
-            Axis::linear("accuracy, %").within(LEAST_SHOWN, 115.0),
+            Axis::linear("accuracy, %").within(LEAST_SHOWN, 124.0),
         );
         Method::ALL.into_iter().fold(chart, |chart, method| {
             let points = self.groups.iter().enumerate();
