@@ -7,7 +7,7 @@
 //! Each simulated aircraft has a connection of its own to the bus and publishes its next alarm as soon as
 //! the stream has confirmed the last; what is not confirmed is published again under its message id. The
 //! ground is a process of its own with the event streams of [`super`] open. Half-way through the measured
-//! time the server gets SIGKILL, and is back [`AWAY`] later with what was on its disk; that time counts. The
+//! time the server gets SIGKILL, and is back a second later with what was on its disk; that time counts. The
 //! rate is of alarms that the ground's disk gained, not of what was published. In the end the ground's
 //! database is read: every alarm that the stream has confirmed has to be there, once, with its capture time.
 

@@ -4,7 +4,7 @@
 //! sync (`fsync = off`) is refused. Everything lies in a schema of its own, `emberfix`. Places are
 //! `geometry(Point, 4326)` under a spatial index, for the station's queries and anybody else's.
 //! A server that went away is connected to again with the next batch or question.
-//! Beyond this machine the line is TLS ([`super::tls`]); the configuration sees to that.
+//! Beyond this machine the line is TLS (`store::tls`); the configuration sees to that.
 
 use super::super::action::{Action, Kind};
 use super::super::{bus, lock};
