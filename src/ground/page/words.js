@@ -36,7 +36,8 @@ export function age(ms) {
   return `${Math.round(s / 86400)} days ago`;
 }
 
-export const metres = (m) => (Math.abs(m) < 10 ? m.toFixed(1) : Math.round(m).toString()) + " m";
+// Zero has no sign: -0.04 is "0.0 m".
+export const metres = (m) => (Math.abs(m) < 10 ? m.toFixed(1).replace(/^-(0\.0)$/, "$1") : Math.round(m).toString()) + " m";
 export const bearing = (deg) => `${String(Math.round(deg) % 360).padStart(3, "0")}°`;
 const towards = (deg) => COMPASS[Math.round((((deg % 360) + 360) % 360) / 45) % 8];
 export const clock = (at) => new Date(at).toLocaleTimeString("en-GB");
