@@ -38,6 +38,7 @@ use emberfix_frames::{
 };
 use emberfix_mav::telemetry::{GpsRaw, TimeSyncMessage, WindEstimate};
 use emberfix_mav::{Address, Received, SystemId, Telemetry};
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 /// One thing that reached the service.
@@ -469,9 +470,8 @@ impl Pipeline {
                 }
             }
         }
-        let fires = self.tracker.fires();
-        self.gallery
-            .keep(|id| fires.iter().any(|fire| fire.id == id));
+        let there: BTreeSet<FireId> = self.tracker.fires().iter().map(|fire| fire.id).collect();
+        self.gallery.keep(|id| there.contains(&id));
         pictures
     }
 
