@@ -359,7 +359,9 @@ fn check_path(checks: &mut Checks, path: &PathConfig) {
         PathConfig::Patrol {
             waypoints_m,
             speed_m_s,
+            laps,
         } => {
+            checks.range("sim.flight.path.laps", f64::from(*laps), 1.0, 1e3);
             checks.range("sim.flight.path.speed_m_s", *speed_m_s, 0.5, 60.0);
             checks.range(
                 "sim.flight.path.waypoints_m (count)",
@@ -367,7 +369,9 @@ fn check_path(checks: &mut Checks, path: &PathConfig) {
                 2.0,
                 1e4,
             );
-            for (leg, ends) in waypoints_m.windows(2).enumerate() {
+            let way_back = (*laps > 1).then_some(waypoints_m.first()).flatten();
+            let lap: Vec<_> = waypoints_m.iter().chain(way_back).collect();
+            for (leg, ends) in lap.windows(2).enumerate() {
                 let apart = (0..3)
                     .map(|i| (ends[1][i] - ends[0][i]).powi(2))
                     .sum::<f64>()
@@ -416,6 +420,7 @@ pub(crate) mod tests {
             path: PathConfig::Patrol {
                 waypoints_m,
                 speed_m_s: 5.5,
+                laps: 1,
             },
             gusts: GustConfig::calm(),
         }

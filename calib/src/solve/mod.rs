@@ -41,7 +41,7 @@ pub use find::{find_corners, make_consistent, read_grey};
 pub use predict::{RangeError, disparity_sigma_px, range_errors};
 pub use state::{BoardPose, GLOBALS, GlobalMatrix, GlobalVector, Step, parameter_names};
 pub use trust::{Dropped, HeldOut, cross_validate, drop_worst};
-pub use wanted::{Hold, Look, Wanted};
+pub use wanted::{Hold, Look, USUAL_VIEWS, Wanted};
 
 use crate::{Camera, RawPixel};
 use emberfix_frames::{Matrix3, Vector3};

@@ -76,8 +76,8 @@ impl fmt::Display for Look {
 const OF_EACH_HOLD: usize = 3;
 /// Views of each distance.
 const OF_EACH_DISTANCE: usize = 4;
-/// Views in all.
-const IN_ALL: usize = 20;
+/// Views in all that do for most uses.
+pub const USUAL_VIEWS: usize = 20;
 /// Share of the coverage grid's cells that corners must have fallen into, in each eye.
 const COVERED: f64 = 0.75;
 
@@ -86,17 +86,20 @@ const COVERED: f64 = 0.75;
 pub struct Wanted {
     board: Board,
     size: (u32, u32),
+    in_all: usize,
     looks: Vec<Look>,
     covered: [BTreeSet<usize>; 2],
 }
 
 impl Wanted {
-    /// Nothing taken yet, of images of this size.
+    /// Nothing taken yet, of images of this size; `in_all` views are wanted at least
+    /// ([`USUAL_VIEWS`]; every fourfold number halves what range is off by).
     #[must_use]
-    pub fn new(board: Board, image_size_px: (u32, u32)) -> Self {
+    pub fn new(board: Board, image_size_px: (u32, u32), in_all: usize) -> Self {
         Self {
             board,
             size: image_size_px,
+            in_all,
             looks: Vec::new(),
             covered: [BTreeSet::new(), BTreeSet::new()],
         }
@@ -137,10 +140,10 @@ impl Wanted {
         missing.extend(self.missing_holds());
         missing.extend(self.missing_places());
         missing.extend(self.missing_distances());
-        if missing.is_empty() && self.taken() < IN_ALL {
+        if missing.is_empty() && self.taken() < self.in_all {
             missing.push(format!(
                 "{} more, each held otherwise",
-                IN_ALL - self.taken()
+                self.in_all - self.taken()
             ));
         }
         missing
@@ -325,7 +328,7 @@ mod tests {
 
     #[test]
     fn a_view_is_told_as_a_person_would_tell_it() {
-        let mut wanted = Wanted::new(Board::chess(9, 6, 0.028), SIZE);
+        let mut wanted = Wanted::new(Board::chess(9, 6, 0.028), SIZE, USUAL_VIEWS);
         for (turn_deg, at_m, told) in [
             (
                 [0.0, 0.0, 0.0],
@@ -367,7 +370,7 @@ mod tests {
 
     #[test]
     fn what_is_missing_shrinks_and_ends() {
-        let mut wanted = Wanted::new(Board::chess(9, 6, 0.028), SIZE);
+        let mut wanted = Wanted::new(Board::chess(9, 6, 0.028), SIZE, USUAL_VIEWS);
         let first = wanted.missing();
         assert!(
             first

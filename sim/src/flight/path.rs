@@ -13,6 +13,9 @@ pub enum PathConfig {
         waypoints_m: Vec<[f64; 3]>,
         /// Mean speed along the legs, m/s.
         speed_m_s: f64,
+        /// How often to fly through all of them, from the last to the first again.
+        #[serde(default = "one_lap")]
+        laps: u16,
     },
     /// Around a point.
     Orbit {
@@ -31,6 +34,10 @@ pub enum PathConfig {
         /// Where the nose points.
         nose: Nose,
     },
+}
+
+fn one_lap() -> u16 {
+    1
 }
 
 /// Where the nose points.
@@ -64,11 +71,13 @@ impl Path {
             PathConfig::Patrol {
                 waypoints_m,
                 speed_m_s,
+                laps,
             } => {
                 let above_ground = |&[east, north, height]: &[f64; 3]| {
                     Vector3::new(east, north, ground_up_m(east, north) + height)
                 };
-                let points = waypoints_m.iter().map(above_ground).collect();
+                let lap: Vec<_> = waypoints_m.iter().map(above_ground).collect();
+                let points = lap.repeat(usize::from(*laps));
                 Self::Patrol(Spline::new(points, *speed_m_s))
             }
             PathConfig::Orbit {
@@ -217,6 +226,22 @@ mod tests {
         for (time, point) in spline.times_s.iter().zip(&spline.points_m) {
             assert!((spline.at(*time) - point).norm() < 1e-9);
         }
+    }
+
+    #[test]
+    fn a_second_lap_comes_by_the_first_waypoint_again() {
+        let waypoints_m = vec![[0.0, 0.0, 10.0], [30.0, 0.0, 10.0], [0.0, 40.0, 10.0]];
+        let path = Path::new(
+            &PathConfig::Patrol {
+                waypoints_m,
+                speed_m_s: 5.0,
+                laps: 2,
+            },
+            |_, _| 0.0,
+        );
+        // 30 m, 50 m and 40 m at 5 m/s.
+        let again = path.position_m(24.0);
+        assert!((again - Vector3::new(0.0, 0.0, 10.0)).norm() < 1e-9);
     }
 
     #[test]

@@ -15,9 +15,12 @@ pub struct CalibrationArguments {
     /// Simulated rigs; every second one has a near-infrared left eye.
     #[arg(long, default_value_t = 20)]
     rigs: usize,
-    /// Pairs of pictures a rig.
-    #[arg(long, default_value_t = 40)]
+    /// Pairs a rig by eyes that are triggered together and a board held still.
+    #[arg(long, default_value_t = 100)]
     pairs: usize,
+    /// Pairs a rig by eyes that are not in step and a board in a moving hand.
+    #[arg(long, default_value_t = 40)]
+    snapshots: usize,
     /// Folder of the real pictures `left01.jpg` ..; that of EMBERFIX_SHARED or ../shared if not given.
     #[arg(long)]
     chess_a: Option<PathBuf>,
@@ -28,7 +31,7 @@ pub struct CalibrationArguments {
     #[arg(long, default_value = "missions/marker.toml")]
     flight_mission: PathBuf,
     /// A tenth of the work: 4 rigs of 25 pairs, and one flight.
-    #[arg(long, conflicts_with_all = ["rigs", "pairs", "flights"])]
+    #[arg(long, conflicts_with_all = ["rigs", "pairs", "snapshots", "flights"])]
     quick: bool,
     #[command(flatten)]
     common: super::Common,
@@ -46,9 +49,10 @@ pub fn calibration(arguments: &CalibrationArguments) -> Result<(), Failure> {
         seed: arguments.seed,
         rigs: arguments.of_work(arguments.rigs, 4),
         pairs: arguments.of_work(arguments.pairs, 25),
+        snapshots: arguments.of_work(arguments.snapshots, 25),
         chess_a: chess_a(arguments),
     };
-    let bar = ProgressBar::new(options.rigs as u64).with_message("simulated rigs");
+    let bar = ProgressBar::new(2 * options.rigs as u64).with_message("simulated rigs");
     if let Ok(style) = ProgressStyle::with_template("{msg} {wide_bar} {pos}/{len}") {
         bar.set_style(style);
     }

@@ -14,10 +14,32 @@ use std::path::Path;
 /// P2's and P4's board.
 const BOARD: Board = Board::chess(9, 6, 0.028);
 
+/// How the pairs of a rig are taken.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Taken {
+    /// By eyes that are triggered together, of a board held as still as `calibrate stereo --live` asks.
+    InStep,
+    /// A folder of snapshots: eyes not quite in step, and a hand that moves, in a quarter of the pairs by
+    /// much.
+    Snapshots,
+}
+
+impl Taken {
+    pub(super) const BOTH: [Self; 2] = [Self::InStep, Self::Snapshots];
+
+    pub(super) fn word(self) -> &'static str {
+        match self {
+            Self::InStep => "in_step",
+            Self::Snapshots => "snapshots",
+        }
+    }
+}
+
 /// What came of one rig.
 #[derive(Debug)]
 pub(super) struct Outcome {
     number: usize,
+    pub taken: Taken,
     pub infrared: bool,
     pairs: usize,
     rms_px: f64,
@@ -50,6 +72,7 @@ impl Outcome {
         };
         vec![
             format!("{} {eyes}", self.number),
+            self.taken.word().to_owned(),
             self.pairs.to_string(),
             format!("{:.3}", self.rms_px),
             self.focal.map(|pull| format!("{pull:+.1}")).join(" "),
@@ -64,16 +87,19 @@ impl Outcome {
 
     pub(super) fn details(&self) -> serde_json::Value {
         serde_json::json!({
-            "rig": self.number, "near_infrared": self.infrared, "pairs": self.pairs,
+            "rig": self.number, "near_infrared": self.infrared, "taken": self.taken.word(),
+            "pairs": self.pairs,
             "rms_px": self.rms_px, "widened_by": self.widened_by, "pulls": self.pulls(),
             "range_bias_10m": self.range_bias, "range_sigma_10m": self.range_sigma,
         })
     }
 }
 
+/// Makes up rig `number` of a seed, takes its pairs, calibrates it and compares.
 pub(super) fn calibrate(
     seed: u64,
     number: usize,
+    taken: Taken,
     pairs: usize,
 ) -> Result<Outcome, CalibrationEvalError> {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
@@ -81,10 +107,11 @@ pub(super) fn calibrate(
     let infrared = number % 2 == 1;
     let truth = make_up(&mut random, infrared);
     let rig = truth.check(Path::new("simulated rig"))?;
-    let views = photograph(&rig, infrared, pairs, &mut random)?;
+    let views = photograph(&rig, infrared, taken, pairs, &mut random)?;
     let size = truth.left.image_size_px;
     let calibration = solve(&BOARD, views, size, Demands::default())?;
-    compare(number, infrared, &truth, &rig, &calibration)
+    let made = (number, infrared, taken);
+    compare(made, &truth, &rig, &calibration)
 }
 
 /// P3's class of rig, or P4's with its near-infrared left eye (Table I, straightened).
@@ -142,6 +169,7 @@ fn make_up(random: &mut impl Rng, infrared: bool) -> RigParts {
 fn photograph(
     rig: &Rig,
     infrared: bool,
+    taken: Taken,
     pairs: usize,
     random: &mut ChaCha8Rng,
 ) -> Result<Vec<View>, CalibrationEvalError> {
@@ -158,7 +186,7 @@ fn photograph(
             turn,
             origin_m,
         };
-        let (stepped, blur_px) = step(&held, random);
+        let (stepped, blur_px) = step(&held, taken, random);
         let in_right = Held {
             turn: rig.right_from_left() * stepped.turn,
             origin_m: rig.right_from_left() * stepped.origin_m
@@ -188,17 +216,20 @@ fn paper(random: &mut impl Rng) -> Paper {
     }
 }
 
-/// Share of the pairs in which the hand did not hold still.
+/// Share of the snapshots in which the hand did not hold still.
 const UNSTEADY: f64 = 0.25;
 
-/// The board as the other eye finds it, and the blur of its motion: eyes are not quite in step, and hands
-/// mostly hold still.
-fn step<'a>(held: &Held<'a>, random: &mut impl Rng) -> (Held<'a>, f64) {
-    let unsteady = random.random_bool(UNSTEADY);
-    let (turn_rad, move_m, blur_px) = if unsteady {
-        (4e-3, 6e-4, random.random_range(0.3..1.0))
-    } else {
-        (5e-4, 1e-4, 0.0)
+/// The board as the other eye finds it, and the blur of its motion.
+fn step<'a>(held: &Held<'a>, taken: Taken, random: &mut impl Rng) -> (Held<'a>, f64) {
+    // What `--live` calls still is half a pixel from one look to the next: some millimetres and hundredths
+    // of a radian a second, over the millisecond that a rig's `max_skew_s` grants eyes with one trigger.
+    const STILL: (f64, f64, f64) = (5e-5, 1e-5, 0.0);
+    let (turn_rad, move_m, blur_px) = match taken {
+        Taken::InStep => STILL,
+        Taken::Snapshots if random.random_bool(UNSTEADY) => {
+            (4e-3, 6e-4, random.random_range(0.3..1.0))
+        }
+        Taken::Snapshots => (5e-4, 1e-4, 0.0),
     };
     let mut vector = |size: f64| Vector3::from_fn(|_, _| random.random_range(-size..size));
     let turn = UnitQuaternion::from_scaled_axis(vector(turn_rad)).to_rotation_matrix();
@@ -283,8 +314,7 @@ fn seen_whole(rig: &Rig, (turn, origin_m): &(Matrix3<f64>, Vector3<f64>)) -> boo
 }
 
 fn compare(
-    number: usize,
-    infrared: bool,
+    (number, infrared, taken): (usize, bool, Taken),
     truth: &RigParts,
     rig: &Rig,
     calibration: &Calibration,
@@ -311,6 +341,7 @@ fn compare(
     Ok(Outcome {
         number,
         infrared,
+        taken,
         pairs: calibration.views.len(),
         rms_px: solution.rms_px(),
         widened_by: solution.widened_by,

@@ -28,7 +28,7 @@ pub fn watch(arguments: &StereoArguments, url: &str, board: &Board) -> Result<Lo
     if let Some(folder) = &arguments.keep {
         std::fs::create_dir_all(folder).map_err(Failure::failed)?;
     }
-    let mut watcher = Watcher::new(*board, arguments.keep.as_deref());
+    let mut watcher = Watcher::new(*board, arguments.live_pairs, arguments.keep.as_deref());
     let end = Instant::now() + Duration::from_secs_f64(arguments.live_limit_s);
     eprintln!(
         "show the board ({}) to both cameras, and hold it still",
@@ -52,6 +52,7 @@ const NEW_WIDTHS: f64 = 0.05;
 
 struct Watcher<'a> {
     board: Board,
+    in_all: usize,
     keep: Option<&'a Path>,
     /// Known from the first picture on.
     wanted: Option<Wanted>,
@@ -61,9 +62,10 @@ struct Watcher<'a> {
 }
 
 impl<'a> Watcher<'a> {
-    fn new(board: Board, keep: Option<&'a Path>) -> Self {
+    fn new(board: Board, in_all: usize, keep: Option<&'a Path>) -> Self {
         Self {
             board,
+            in_all,
             keep,
             wanted: None,
             looked: Looked::default(),
@@ -124,7 +126,7 @@ impl<'a> Watcher<'a> {
             }
         };
         if self.wanted.is_none() {
-            self.wanted = Some(Wanted::new(self.board, size));
+            self.wanted = Some(Wanted::new(self.board, size, self.in_all));
             self.looked.size = size;
         }
         if size != self.looked.size {

@@ -7,7 +7,7 @@ mod tell;
 use super::mounting::{Asked, Known, MountingArguments};
 use crate::cli::Failure;
 use anyhow::anyhow;
-use emberfix_calib::solve::{Board, Calibration, Demands, Model, calibrate};
+use emberfix_calib::solve::{Board, Calibration, Demands, Model, USUAL_VIEWS, calibrate};
 use emberfix_calib::{Calibrated, PageInput, RigParts, page};
 use indicatif::ProgressBar;
 use look::Looked;
@@ -23,6 +23,10 @@ pub struct StereoArguments {
     /// board is held still, and what is missing is said, until there is enough.
     #[arg(long, value_name = "URL")]
     live: Option<String>,
+    /// Pairs that are taken at least while the camera is watched; with four times as many, range is half
+    /// as far off.
+    #[arg(long, default_value_t = USUAL_VIEWS, requires = "live")]
+    live_pairs: usize,
     /// Longest that the camera is watched, seconds.
     #[arg(long, default_value_t = 900.0, requires = "live", value_parser = seconds)]
     live_limit_s: f64,
