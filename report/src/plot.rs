@@ -107,6 +107,13 @@ impl Axis {
         let air = ((high - low) * 0.05).max(high.abs() * 1e-3).max(1e-9);
         low - air..high + air
     }
+
+    /// How far along the axis a value is, 0 to 1.
+    fn share(&self, value: f64, range: &Range<f64>) -> f64 {
+        let scaled = |value: f64| if self.log { value.ln() } else { value };
+        let (low, high) = (scaled(range.start), scaled(range.end));
+        (scaled(value) - low) / (high - low)
+    }
 }
 
 /// One chart.
@@ -155,7 +162,7 @@ pub enum PlotError {
 const WIDTH_PX: u32 = 720;
 const HEIGHT_PX: u32 = 460;
 /// Distinct also for colour-blind readers (Okabe and Ito), darkest first.
-const COLOURS: [RGBColor; 8] = [
+const COLOURS: [RGBColor; 9] = [
     RGBColor(0, 114, 178),
     RGBColor(213, 94, 0),
     RGBColor(0, 158, 115),
@@ -164,7 +171,12 @@ const COLOURS: [RGBColor; 8] = [
     RGBColor(86, 180, 233),
     RGBColor(90, 90, 90),
     RGBColor(0, 0, 0),
+    RGBColor(122, 70, 20),
 ];
+/// Share of a chart's width that its legend takes, and of its height for each entry.
+const LEGEND: (f64, f64) = (0.36, 0.06);
+/// Places between two points of a line that a legend should not cover.
+const BETWEEN: u32 = 8;
 
 impl Chart {
     /// A chart without points yet.
@@ -205,12 +217,47 @@ impl Chart {
         let points = || self.series.iter().flat_map(|series| &series.points);
         let x = self.x.range(points().map(|point| point.0));
         let y = self.y.range(points().map(|point| point.1));
+        let corner = self.emptiest_corner(&x, &y);
         match (self.x.log, self.y.log) {
-            (false, false) => self.draw_in(area, x, y),
-            (true, false) => self.draw_in(area, x.log_scale(), y),
-            (false, true) => self.draw_in(area, x, y.log_scale()),
-            (true, true) => self.draw_in(area, x.log_scale(), y.log_scale()),
+            (false, false) => self.draw_in(area, x, y, corner),
+            (true, false) => self.draw_in(area, x.log_scale(), y, corner),
+            (false, true) => self.draw_in(area, x, y.log_scale(), corner),
+            (true, true) => self.draw_in(area, x.log_scale(), y.log_scale(), corner),
         }
+    }
+
+    /// Where a legend covers least of what is drawn.
+    fn emptiest_corner(&self, x: &Range<f64>, y: &Range<f64>) -> SeriesLabelPosition {
+        let high = LEGEND.1 * self.series.len() as f64;
+        let drawn: Vec<(f64, f64)> = self
+            .series
+            .iter()
+            .flat_map(|series| series.points.windows(2))
+            .flat_map(|ends| {
+                let place = |(u, v): (f64, f64)| (self.x.share(u, x), self.y.share(v, y));
+                let (from, to) = (place(ends[0]), place(ends[1]));
+                (0..=BETWEEN).map(move |k| {
+                    let t = f64::from(k) / f64::from(BETWEEN);
+                    (from.0 + t * (to.0 - from.0), from.1 + t * (to.1 - from.1))
+                })
+            })
+            .collect();
+        let covered = |right: bool, upper: bool| {
+            let near = |share: f64, far: bool| if far { 1.0 - share } else { share };
+            let under = |(u, v): &&(f64, f64)| {
+                (0.0..LEGEND.0).contains(&near(*u, right)) && (0.0..high).contains(&near(*v, upper))
+            };
+            drawn.iter().filter(under).count()
+        };
+        [
+            (covered(false, true), SeriesLabelPosition::UpperLeft),
+            (covered(true, true), SeriesLabelPosition::UpperRight),
+            (covered(true, false), SeriesLabelPosition::LowerRight),
+            (covered(false, false), SeriesLabelPosition::LowerLeft),
+        ]
+        .into_iter()
+        .min_by_key(|(covered, _)| *covered)
+        .map_or(SeriesLabelPosition::UpperLeft, |(_, corner)| corner)
     }
 
     fn draw_in<X, Y>(
@@ -218,6 +265,7 @@ impl Chart {
         area: &DrawingArea<SVGBackend<'_>, Shift>,
         x: X,
         y: Y,
+        corner: SeriesLabelPosition,
     ) -> Result<(), PlotError>
     where
         X: AsRangedCoord<Value = f64>,
@@ -249,7 +297,7 @@ impl Chart {
         if self.series.iter().any(|series| !series.label.is_empty()) {
             chart
                 .configure_series_labels()
-                .position(SeriesLabelPosition::UpperLeft)
+                .position(corner)
                 .background_style(WHITE.mix(0.8))
                 .border_style(BLACK.mix(0.3))
                 .label_font(("sans-serif", 13))
@@ -296,9 +344,11 @@ impl Chart {
             legend = Some(chart.draw_series(dots).map_err(failed)?);
         }
         if let (Some(legend), false) = (legend, series.label.is_empty()) {
+            // A dashed line is half a line here too.
+            let reach = if series.mark == Mark::Dashed { 9 } else { 18 };
             legend
                 .label(&series.label)
-                .legend(move |(x, y)| PathElement::new(vec![(x, y), (x + 18, y)], style));
+                .legend(move |(x, y)| PathElement::new(vec![(x, y), (x + reach, y)], style));
         }
         Ok(())
     }

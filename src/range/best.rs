@@ -1,55 +1,53 @@
 //! All methods that apply, weighed by what each says of its own error; contradiction is refusal.
 
+use super::error::{Matched, Sigma};
 use super::scene::Scene;
 use super::{
     Disparity, Method, Methods, Miss, RangeConfig, Refusal, centroid, correlate, cross_spectral,
 };
 use emberfix_calib::RectifiedPixel;
 
+/// What one method said.
+type Said = (Method, Result<Voice, Refusal>);
+
 /// One method's disparity.
 #[derive(Debug, Clone, Copy)]
 struct Voice {
     method: Method,
     found: Disparity,
+    sigma: Sigma,
+    likeness: f64,
 }
 
-/// Disparities agree when they differ by less than this many of their sigmas, and a little.
+/// Disparities agree when they differ by less than this many sigmas of what is their own.
 const AGREE_SIGMAS: f64 = 3.0;
-const AGREE_PX: f64 = 0.4;
-/// A flame is about as deep as it is wide, and methods weigh its near and far parts differently: by
-/// this share of the depth they may differ.
-const AGREE_DEPTH: f64 = 0.12;
-/// A single voice is believed this much less.
-const ALONE: f64 = 1.5;
-
+/// Correlation of the methods' own errors: they look at the same pixels, each in its own way. On rendered
+/// flames (the tuning set of `emberfix eval range`) it is 0.27 between correlation and centroids, and less
+/// between either and features.
+const ALIKE: f64 = 0.25;
+/// A single voice that is not sure is believed this much less.
+const ALONE: f64 = 2.0;
 /// A correlation above this needs no other voice, unless one contradicts.
 const SURE: f64 = 0.9;
 
 /// Correlation and centroids; where they leave doubt the features that survive a change of spectrum
 /// decide.
 pub(super) fn find(scene: &Scene<'_>, config: &RangeConfig) -> Result<(Disparity, Methods), Miss> {
-    let honest = |method: Method, found: &Disparity| scene.honest(method, found);
-    let first = refusal(correlate::find(scene, config))?;
-    let sure = first.is_ok_and(|said| said.likeness > SURE);
-    let first = first.map(|said| honest(Method::Correlate, &said.found));
-    let second = centroid::find(scene, config).map(|said| honest(Method::Centroid, &said));
-    let depth_px = |px: f64| AGREE_DEPTH * px.abs() * scene.target.width() as f64 / scene.focal_px;
-    let agree = |a: &Disparity, b: &Disparity| {
-        let apart = AGREE_SIGMAS * a.sigma_px.hypot(b.sigma_px) + AGREE_PX + depth_px(a.px);
-        (a.px - b.px).abs() < apart
-    };
-    let settled = match (&first, &second) {
-        (Ok(a), Ok(b)) => agree(a, b),
+    let mut said = vec![
+        voice(scene, Method::Correlate, correlate::find(scene, config))?,
+        voice(scene, Method::Centroid, centroid::find(scene, config))?,
+    ];
+    let sure = said[0].1.is_ok_and(|voice| voice.likeness > SURE);
+    let settled = match (&said[0].1, &said[1].1) {
+        (Ok(a), Ok(b)) => a.agrees(b),
         (Ok(_), Err(why)) => sure && !warns(*why),
         (Err(_), _) => false,
     };
-    let mut said = vec![(Method::Correlate, first), (Method::Centroid, second)];
     if !settled {
-        let third = refusal(cross_spectral::find(scene, config))?;
-        let third = third.map(|said| honest(Method::CrossSpectral, &said));
-        said.push((Method::CrossSpectral, third));
+        let third = cross_spectral::find(scene, config);
+        said.push(voice(scene, Method::CrossSpectral, third)?);
     }
-    Ok(decide(&said, agree, if sure { 1.0 } else { ALONE })?)
+    Ok(decide(&said, if sure { 1.0 } else { ALONE })?)
 }
 
 /// Whether a refusal speaks against every other method's answer.
@@ -61,35 +59,39 @@ fn warns(why: Refusal) -> bool {
 }
 
 /// A failure is passed on, a refusal is one voice less.
-fn refusal<T>(said: Result<T, Miss>) -> Result<Result<T, Refusal>, Miss> {
+fn voice(scene: &Scene<'_>, method: Method, said: Result<Matched, Miss>) -> Result<Said, Miss> {
     match said {
-        Ok(found) => Ok(Ok(found)),
-        Err(Miss::Refused(why)) => Ok(Err(why)),
+        Ok(matched) => {
+            let voice = Voice {
+                method,
+                found: matched.found,
+                sigma: scene.sigma(&matched),
+                likeness: matched.likeness,
+            };
+            Ok((method, Ok(voice)))
+        }
+        Err(Miss::Refused(why)) => Ok((method, Err(why))),
         Err(failed) => Err(failed),
     }
 }
 
-fn decide(
-    said: &[(Method, Result<Disparity, Refusal>)],
-    agree: impl Fn(&Disparity, &Disparity) -> bool,
-    alone: f64,
-) -> Result<(Disparity, Methods), Refusal> {
-    let voices: Vec<Voice> = said
-        .iter()
-        .filter_map(|(method, said)| {
-            let found = said.ok()?;
-            Some(Voice {
-                method: *method,
-                found,
-            })
-        })
-        .collect();
+impl Voice {
+    /// What all methods see alike does not set them apart.
+    fn agrees(&self, other: &Self) -> bool {
+        let apart_px = (self.found.px - other.found.px).abs();
+        apart_px < AGREE_SIGMAS * self.sigma.own_px.hypot(other.sigma.own_px)
+    }
+
+    fn weight(&self) -> f64 {
+        self.sigma.own_px.powi(-2)
+    }
+}
+
+fn decide(said: &[Said], alone: f64) -> Result<(Disparity, Methods), Refusal> {
+    let voices: Vec<Voice> = said.iter().filter_map(|(_, said)| said.ok()).collect();
     let groups = voices.iter().map(|one| -> Vec<Voice> {
-        voices
-            .iter()
-            .filter(|other| agree(&one.found, &other.found))
-            .copied()
-            .collect()
+        let agreeing = voices.iter().filter(|other| one.agrees(other));
+        agreeing.copied().collect()
     });
     let largest = groups.max_by_key(Vec::len).unwrap_or_default();
     match largest[..] {
@@ -101,7 +103,7 @@ fn decide(
 }
 
 /// What the first method said: it is the one that looks hardest for rivals.
-fn first_refusal(said: &[(Method, Result<Disparity, Refusal>)]) -> Refusal {
+fn first_refusal(said: &[Said]) -> Refusal {
     said.iter()
         .find_map(|(_, said)| said.err())
         .unwrap_or(Refusal::NoPeak)
@@ -110,7 +112,7 @@ fn first_refusal(said: &[(Method, Result<Disparity, Refusal>)]) -> Refusal {
 /// One method alone, unless another one saw a rival.
 fn trusted_alone(
     voice: Voice,
-    said: &[(Method, Result<Disparity, Refusal>)],
+    said: &[Said],
     widened: f64,
 ) -> Result<(Disparity, Methods), Refusal> {
     let refusals = said.iter().filter_map(|(_, said)| said.err());
@@ -118,34 +120,58 @@ fn trusted_alone(
         return Err(why);
     }
     let found = Disparity {
-        sigma_px: widened * voice.found.sigma_px,
+        sigma_px: (widened * voice.sigma.own_px).hypot(voice.sigma.shared_px),
         ..voice.found
     };
     Ok((found, Methods::only(voice.method)))
 }
 
-/// Mean by information. They look at the same pixels, so their errors are taken to be one.
+/// Mean by information.
 fn weighed(voices: &[Voice]) -> (Disparity, Methods) {
-    let weight = |voice: &Voice| voice.found.sigma_px.powi(-2);
-    let sum: f64 = voices.iter().map(weight).sum();
-    let mean = |value: fn(&Disparity) -> f64| {
-        let weighted = |voice: &Voice| weight(voice) * value(&voice.found);
-        voices.iter().map(weighted).sum::<f64>() / sum
+    let sum: f64 = voices.iter().map(Voice::weight).sum();
+    let mean = |value: &dyn Fn(&Voice) -> f64| {
+        let weighted = voices.iter().map(|voice| voice.weight() * value(voice));
+        weighted.sum::<f64>() / sum
     };
+    let px = mean(&|voice| voice.found.px);
     let used = voices
         .iter()
         .map(|voice| Methods::only(voice.method))
         .fold(Methods::default(), Methods::with);
+    let own_px = together_px(voices) * disagreement(voices, px);
     let found = Disparity {
-        px: mean(|found| found.px),
-        // Wholly correlated errors: the mean's is the mean of theirs.
-        sigma_px: mean(|found| found.sigma_px),
+        px,
+        sigma_px: own_px.hypot(mean(&|voice| voice.sigma.shared_px)),
         // Each voice speaks of its own rows, so their mean speaks of the mean row.
         centroid: RectifiedPixel {
-            u: mean(|found| found.centroid.u),
-            v: mean(|found| found.centroid.v),
+            u: mean(&|voice| voice.found.centroid.u),
+            v: mean(&|voice| voice.found.centroid.v),
         },
         ..voices[0].found
     };
     (found, used)
+}
+
+/// One sigma of the mean from the methods' own errors, each pair of which is correlated.
+fn together_px(voices: &[Voice]) -> f64 {
+    // By information each error enters the mean with its reciprocal, over all information.
+    let entering: Vec<f64> = voices
+        .iter()
+        .map(|voice| 1.0 / voice.sigma.own_px)
+        .collect();
+    let (sum, squares): (f64, f64) = entering
+        .iter()
+        .fold((0.0, 0.0), |(sum, squares), e| (sum + e, squares + e * e));
+    (ALIKE * sum * sum + (1.0 - ALIKE) * squares).sqrt() / squares
+}
+
+/// How much further apart the voices are than they say (Birge's ratio), at least 1: agreement by chance
+/// narrows nothing.
+fn disagreement(voices: &[Voice], mean_px: f64) -> f64 {
+    let squares = voices
+        .iter()
+        .map(|voice| voice.weight() * (voice.found.px - mean_px).powi(2));
+    (squares.sum::<f64>() / (voices.len() - 1) as f64)
+        .sqrt()
+        .max(1.0)
 }

@@ -1,9 +1,10 @@
 //! Matching all pixels of a target as one: normalised correlation over the whole search, then least
 //! squares below the pixel.
 
+use super::error::{Factors, Matched};
 use super::refine::{Refined, Refiner};
 use super::scene::{Mask, Run, Scene};
-use super::search::{Curve, Peak, correlate, rows_apart};
+use super::search::{Curve, Peak, correlate};
 use super::{Disparity, Miss, RangeConfig, Refusal};
 use emberfix_calib::RectifiedPixel;
 
@@ -11,9 +12,17 @@ use emberfix_calib::RectifiedPixel;
 const OUTLINE_PX: usize = 2;
 /// Below the pixel only the flame's own edge counts: the ground beside it lies at another disparity.
 const RIM_PX: usize = 1;
-/// What the eyes show differently is an error that the residuals' size alone does not tell: sigma grows
-/// by this times what is missing to full correlation.
-const UNLIKE: f64 = 4.0;
+/// How its error follows from what it saw.
+const FACTORS: Factors = Factors {
+    scatter: 0.48,
+    unlike: (0.03, 0.22),
+    least_px: 0.048,
+};
+/// The same between two spectra, where grey levels are unlike anyway: a third of it is the flame's doing.
+const TWO_SPECTRA: Factors = Factors {
+    unlike: (0.01, 0.07),
+    ..FACTORS
+};
 /// Disagreement of the search there and back that is none.
 const BACK_PX: i32 = 2;
 /// A second peak counts as a rival when it leaves less than this share more unexplained.
@@ -21,33 +30,29 @@ const RIVAL: f64 = 1.35;
 /// Peaks nearer to each other than this are one.
 const SAME_PEAK_PX: i32 = 2;
 
-/// A disparity and how much the target resembles what is there.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Correlated {
-    pub found: Disparity,
-    /// Normalised correlation at the whole pixel, 0..1.
-    pub likeness: f64,
-}
-
-pub(super) fn find(scene: &Scene<'_>, config: &RangeConfig) -> Result<Correlated, Miss> {
+pub(super) fn find(scene: &Scene<'_>, config: &RangeConfig) -> Result<Matched, Miss> {
     if scene.flame.count() < config.min_support as usize {
         return Err(Refusal::TooSmall.into());
     }
     let outlined = scene.flame.grown(OUTLINE_PX).runs();
-    let every = rows_apart(&outlined);
-    let offsets = (-scene.search.greatest)..=(-scene.search.least);
-    let curve = correlate(&scene.left.gray, &scene.right, &outlined, every, offsets);
+    let offsets = scene.search.offsets();
+    let curve = correlate(&scene.left, &scene.right, &outlined, scene.every, offsets);
     let peak = rival_free(&curve, config.min_correlation, -scene.search.greatest)?;
-    there_and_back(scene, &outlined, every, &peak)?;
+    there_and_back(scene, &outlined, &peak)?;
     let right = scene.opposite(peak.at)?;
     let weights = scene.weights(RIM_PX);
-    let refined = Refiner::new(&scene.left.gray, &right, &weights, -peak.at)
+    let refined = Refiner::new(&scene.left, &right, &weights, -peak.at)
         .and_then(|refiner| refiner.refine())
         .ok_or(Refusal::Inconsistent)?;
-    let unlike = 1.0 + UNLIKE * (1.0 - peak.correlation);
-    Ok(Correlated {
-        found: disparity(&scene.flame, &refined, unlike),
+    Ok(Matched {
+        found: disparity(&scene.flame, &refined.found),
         likeness: peak.correlation,
+        dullness: refined.dullness,
+        factors: if scene.two_spectra {
+            &TWO_SPECTRA
+        } else {
+            &FACTORS
+        },
     })
 }
 
@@ -72,7 +77,7 @@ pub(super) fn rival_free(curve: &Curve, least: f64, nearest: i32) -> Result<Peak
 }
 
 /// What the right eye shows there must match best where it came from.
-fn there_and_back(scene: &Scene<'_>, runs: &[Run], every: i32, peak: &Peak) -> Result<(), Miss> {
+pub(super) fn there_and_back(scene: &Scene<'_>, runs: &[Run], peak: &Peak) -> Result<(), Miss> {
     let moved: Vec<Run> = runs
         .iter()
         .map(|run| Run {
@@ -82,19 +87,20 @@ fn there_and_back(scene: &Scene<'_>, runs: &[Run], every: i32, peak: &Peak) -> R
         })
         .filter(|run| run.from < run.to)
         .collect();
-    let back = scene.back(peak.at, every)?;
-    let curve = correlate(&scene.right, &back, &moved, every, scene.search.all());
+    let back = scene.back(peak.at)?;
+    let all = scene.search.all();
+    let curve = correlate(&scene.right, &back, &moved, scene.every, all);
     match curve.peaks().first() {
         Some(found) if (found.at + peak.at).abs() <= BACK_PX => Ok(()),
         _ => Err(Refusal::OneSided.into()),
     }
 }
 
-/// A disparity with the flame that it is of; its sigma is widened by a factor.
-pub(super) fn disparity(flame: &Mask, refined: &Refined, widened: f64) -> Disparity {
+/// A disparity with the flame that it is of; its sigma is the scatter.
+pub(super) fn disparity(flame: &Mask, refined: &Refined) -> Disparity {
     Disparity {
         px: refined.disparity_px,
-        sigma_px: widened * refined.sigma_px,
+        sigma_px: refined.sigma_px,
         support: flame.count() as u32,
         centroid: RectifiedPixel {
             u: refined.at.0,

@@ -43,6 +43,11 @@ impl HsvMask {
     /// Whether one 8-bit BGR pixel passes.
     #[must_use]
     pub fn keeps(&self, bgr: [u8; 3]) -> bool {
+        // Most of what is about a flame is too dark.
+        let value = f64::from(bgr[0].max(bgr[1]).max(bgr[2])) / 255.0;
+        if value < self.value.0 && self.core_value.is_none_or(|core| value < core) {
+            return false;
+        }
         let [blue, green, red] = bgr.map(|value| f64::from(value) / 255.0);
         self.keeps_hsv(hsv(red, green, blue))
     }

@@ -1,8 +1,8 @@
 //! Box to a range with its error, or why not; the only stereo use of OpenCV.
 //!
 //! **Purpose.** Finds the disparity of one target: rectifies what is around its box (`patch`), keeps
-//! the pixels that look like flame (`mask`), matches them in the right eye by semi-global matching
-//! or by correlation, and pools them (`pool`) to one disparity with its error.
+//! the pixels that look like flame (`mask`), matches them in the right eye by each method, and says
+//! what the error of the answer is made of (`error`).
 //! **In:** the decoded pair, raw, and a box in the raw left image; once per detection. **Out:**
 //! [`Ranging`]: a disparity in rectified pixels (`u_left - u_right`, positive in front), its sigma
 //! and the centroid of the pixels that it rests on, or a named reason why there is none.
@@ -10,8 +10,14 @@
 //! **Assumptions.** Both eyes were exposed within the rig's skew, and the rig's calibration holds.
 //! Depth follows from the *mean disparity*; the mean of depths would be pulled outwards.
 //!
-//! **Known limits.** Flames have no surface: the disparity is that of their visible outline and
-//! texture. What is matched in smoke is the ground that shows through it (on rendered plumes at 20 m
+//! **What a flame's disparity means.** Flames have no surface; what both eyes match is light from all their
+//! depth. The disparity is meant for the flame's *axis*: the vertical through its base, at the row of the
+//! centroid. That is what an estimator needs who looks for the base. The light that is seen lies a little
+//! before the axis, by 3 % of the flame's width in rendered flames; matching follows outlines more than
+//! brightness and gets half of that. It is not corrected, for it depends on the soot; the sigma covers it
+//! (`error`).
+//!
+//! **Known limits.** What is matched in smoke is the ground that shows through it (on rendered plumes at 20 m
 //! the disparity came out a quarter too small), so smoke is always [`Ranging::NoMatch`]. The sigma
 //! is that of matching alone: calibration's share stands in the rig.
 
@@ -20,6 +26,7 @@ mod centroid;
 mod config;
 mod correlate;
 mod cross_spectral;
+mod error;
 mod eyes;
 mod mask;
 mod patch;
@@ -62,10 +69,10 @@ pub struct Target {
     pub box_px: BoxPx,
 }
 
-/// A disparity and what it rests on.
+/// A disparity of a flame's axis and what it rests on.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Disparity {
-    /// `u_left - u_right`, rectified pixels.
+    /// `u_left - u_right` of the vertical through the flame's base, at the centroid's row; rectified pixels.
     pub px: f64,
     /// One sigma of it (matching only; calibration comes on top), pixels.
     pub sigma_px: f64,
@@ -80,7 +87,8 @@ pub struct Disparity {
 pub enum Ranging {
     /// A disparity with its error.
     Measured {
-        /// Disparity of the flame, `u_left - u_right`, rectified pixels.
+        /// `u_left - u_right` of the vertical through the flame's base, at the centroid's row; rectified
+        /// pixels.
         disparity_px: f64,
         /// One sigma of it (matching only; calibration comes on top), pixels.
         sigma_px: f64,

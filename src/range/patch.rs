@@ -72,10 +72,10 @@ impl Gray {
     }
 }
 
-/// The left eye over an area: colour as it came, and gray.
+/// Colours of the left eye over an area, row by row, as they came.
 pub(super) struct Colour {
+    pub area: Area,
     pub bgr: Vec<[u8; 3]>,
-    pub gray: Gray,
 }
 
 /// Samples a rig's images.
@@ -97,6 +97,16 @@ impl Cutter {
     /// Of the rectified pair, pixels.
     pub fn focal_px(&self) -> f64 {
         self.rig.rectification().focal_px()
+    }
+
+    /// What a disparity exceeds that of infinity by, pixels.
+    pub fn beyond_infinity_px(&self, disparity_px: f64) -> f64 {
+        disparity_px - self.rig.rectification().infinity_disparity_px()
+    }
+
+    /// Whether the right eye sees near infrared.
+    pub fn two_spectra(&self) -> bool {
+        self.rig.right_near_infrared()
     }
 
     /// Refuses images that are not the rig's.
@@ -155,47 +165,48 @@ impl Cutter {
         Ok((area.width() > 0 && area.height() > 0).then_some(area))
     }
 
-    /// The left eye over an area, whose rows are cut to the image: gray at the exact places, colour as
-    /// the nearest pixel has it.
+    /// The left eye over an area, whose rows are cut to the image: each place as its nearest pixel.
     pub fn left(&self, image: &Mat, area: Area) -> Result<Colour, RangeError> {
         let area = area.within_rows(self.size().1);
         let raw = Raw::<3>::of(image)?;
-        let luma = self.luma(&raw, area);
         let mut bgr = Vec::with_capacity(area.width() * area.height());
-        let mut values = Vec::with_capacity(bgr.capacity());
-        let seen = self.each_place(Eye::Left, area, |u, v| {
-            values.push(luma.cubic(u, v));
-            bgr.push(raw.nearest(u, v));
-        });
-        Ok(Colour {
-            bgr,
-            gray: Gray { area, seen, values },
-        })
+        self.each_place(Eye::Left, area, 1, |u, v| bgr.push(raw.nearest(u, v)));
+        Ok(Colour { area, bgr })
     }
 
     /// The left eye over an area in gray, each place as its nearest pixel: enough to find whole pixels.
     /// Only rows `every` apart are filled.
     pub fn left_draft(&self, image: &Mat, area: Area, every: i32) -> Result<Gray, RangeError> {
-        let area = area.within_rows(self.size().1);
         let raw = Raw::<3>::of(image)?;
-        let mut values = Vec::with_capacity(area.width() * area.height());
-        let mut seen = (area.left, area.right);
-        for row in area.top..area.bottom {
-            if row % every == 0 {
-                let line = Area {
-                    top: row,
-                    bottom: row + 1,
-                    ..area
-                };
-                let here = self.each_place(Eye::Left, line, |u, v| {
-                    values.push(luma(&raw.nearest(u, v)))
-                });
-                seen = (seen.0.max(here.0), seen.1.min(here.1));
-            } else {
-                values.resize(values.len() + area.width(), 0.0);
-            }
+        Ok(self.draft(Eye::Left, area, every, |u, v| luma(&raw.nearest(u, v))))
+    }
+
+    /// The right eye over an area, straight lines between pixels: enough to find whole pixels. Only rows
+    /// `every` apart are filled.
+    pub fn right_draft(&self, image: &Mat, area: Area, every: i32) -> Result<Gray, RangeError> {
+        let raw = Raw::<1>::of(image)?;
+        Ok(self.draft(Eye::Right, area, every, |u, v| raw.linear(u, v)))
+    }
+
+    fn draft(&self, eye: Eye, area: Area, every: i32, level: impl Fn(f32, f32) -> f32) -> Gray {
+        let area = area.within_rows(self.size().1);
+        let width = area.width();
+        let mut filled = Vec::with_capacity(width * area.height().div_ceil(every as usize));
+        let seen = self.each_place(eye, area, every, |u, v| filled.push(level(u, v)));
+        if every == 1 {
+            return Gray {
+                area,
+                seen,
+                values: filled,
+            };
         }
-        Ok(Gray { area, seen, values })
+        let mut values = vec![0.0; width * area.height()];
+        let rows = (area.top..area.bottom).zip(values.chunks_exact_mut(width.max(1)));
+        let rows = rows.filter(|(row, _)| row % every == 0);
+        for ((_, line), filled) in rows.zip(filled.chunks_exact(width.max(1))) {
+            line.copy_from_slice(filled);
+        }
+        Gray { area, seen, values }
     }
 
     /// The left eye over an area in gray, at the exact places.
@@ -204,16 +215,7 @@ impl Cutter {
         let raw = Raw::<3>::of(image)?;
         let luma = self.luma(&raw, area);
         let mut values = Vec::with_capacity(area.width() * area.height());
-        let seen = self.each_place(Eye::Left, area, |u, v| values.push(luma.cubic(u, v)));
-        Ok(Gray { area, seen, values })
-    }
-
-    /// The right eye over an area, straight lines between pixels: enough to find whole pixels.
-    pub fn right_draft(&self, image: &Mat, area: Area) -> Result<Gray, RangeError> {
-        let area = area.within_rows(self.size().1);
-        let raw = Raw::<1>::of(image)?;
-        let mut values = Vec::with_capacity(area.width() * area.height());
-        let seen = self.each_place(Eye::Right, area, |u, v| values.push(raw.linear(u, v)));
+        let seen = self.each_place(Eye::Left, area, 1, |u, v| values.push(luma.cubic(u, v)));
         Ok(Gray { area, seen, values })
     }
 
@@ -223,7 +225,7 @@ impl Cutter {
         let raw = Raw::<1>::of(image)?;
         let crop = self.crop(Eye::Right, &raw, area, |[value]| f32::from(*value));
         let mut values = Vec::with_capacity(area.width() * area.height());
-        let seen = self.each_place(Eye::Right, area, |u, v| values.push(crop.cubic(u, v)));
+        let seen = self.each_place(Eye::Right, area, 1, |u, v| values.push(crop.cubic(u, v)));
         Ok(Gray { area, seen, values })
     }
 
@@ -254,9 +256,15 @@ impl Cutter {
         raw.crop(left, top, right + 1, bottom + 1, level)
     }
 
-    /// Hands the raw place of every pixel of an area to `take`, row by row; says which columns the image
-    /// really has.
-    fn each_place(&self, eye: Eye, area: Area, mut take: impl FnMut(f32, f32)) -> (i32, i32) {
+    /// Hands the raw place of every pixel of an area's rows `every` apart to `take`, row by row; says which
+    /// columns the image really has.
+    fn each_place(
+        &self,
+        eye: Eye,
+        area: Area,
+        every: i32,
+        mut take: impl FnMut(f32, f32),
+    ) -> (i32, i32) {
         let last_column = (self.size().0 - 1) as f32;
         let mut seen = (area.left, area.right);
         let between =
@@ -268,6 +276,9 @@ impl Cutter {
             if below == 0 {
                 upper = lower;
                 lower = self.knots(eye, area, row + step);
+            }
+            if row % every != 0 {
+                continue;
             }
             let down = below as f32 / KNOTS_PX as f32;
             let knot = |k: usize| between(upper[k], lower[k], down);

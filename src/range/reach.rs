@@ -1,6 +1,6 @@
 //! How far a disparity reaches: measured, only "at least this far", or not to be believed.
 
-use super::{Disparity, Method, Methods, RangeConfig, Ranging, Refusal};
+use super::{Disparity, Methods, RangeConfig, Ranging, Refusal};
 use emberfix_calib::Rig;
 
 /// What decides it.
@@ -9,55 +9,6 @@ pub(super) struct Reach {
     rig: Rig,
     max_sigma_over_range: f64,
     sigma_floor_px: f64,
-}
-
-/// How much of its scatter and of a flame's depth a method's error is: measured on rendered flames (the
-/// tuning set of `emberfix eval range`).
-struct Honesty {
-    /// Standard deviation of its error against the scatter that it states itself.
-    scatter: f64,
-    /// What is seen of a flame is not just its axis, and a flame is about as deep as it is wide: one
-    /// sigma of the difference, as a share of the disparity that its depth spans.
-    depth: f64,
-    /// What sampling and the eyes' different looks leave however much is seen, pixels.
-    least_px: f64,
-}
-
-fn honesty(method: Method) -> Honesty {
-    let (scatter, depth, least_px) = match method {
-        Method::Sgbm => (1.0, 0.0, 0.12),
-        Method::Centroid => (2.1, 0.16, 0.02),
-        Method::Correlate => (0.7, 0.07, 0.05),
-        Method::CrossSpectral => (1.1, 0.10, 0.02),
-        // It is made of the others, whose sigmas are honest already.
-        Method::Best => (1.0, 0.0, 0.0),
-    };
-    Honesty {
-        scatter,
-        depth,
-        least_px,
-    }
-}
-
-/// A method's disparity with the sigma that its errors truly have, for a target of a width.
-pub(super) fn honest(
-    method: Method,
-    found: &Disparity,
-    width_px: usize,
-    focal_px: f64,
-) -> Disparity {
-    let Honesty {
-        scatter,
-        depth,
-        least_px,
-    } = honesty(method);
-    let depth_px = found.px.abs() * width_px as f64 / focal_px;
-    Disparity {
-        sigma_px: (scatter * found.sigma_px)
-            .hypot(depth * depth_px)
-            .hypot(least_px),
-        ..*found
-    }
 }
 
 impl Reach {

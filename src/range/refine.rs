@@ -23,6 +23,14 @@ pub(super) struct Refined {
     pub at: (f64, f64),
 }
 
+/// What least squares found, and how the eyes compare there.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Refinement {
+    pub found: Refined,
+    /// By what share one eye is duller than the other, 0 to 1.
+    pub dullness: f64,
+}
+
 /// How much each pixel of an area counts, 0 to 1.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Weights {
@@ -36,6 +44,8 @@ pub(super) struct Refiner {
     /// Shifted by the whole disparity: the same columns as the left eye's.
     right: Vec<f32>,
     weight: Vec<f32>,
+    /// Columns of each row that may count, whole lanes.
+    counting: Vec<Range<usize>>,
     width: usize,
     height: usize,
     /// Column and row of the raster's first place.
@@ -87,10 +97,12 @@ impl Refiner {
         };
         let averaged = |plane: Vec<f32>| averaged(plane, area.width(), side);
         let middle = 0.5 * (side - 1) as f64;
+        let weight = averaged(weights.over(area, &seen));
         Some(Self {
             left: smoothed(&averaged(plane(left, area, 0)), width),
             right: smoothed(&averaged(plane(right, area, -start_px)), width),
-            weight: averaged(weights.over(area, &seen)),
+            counting: weight.chunks_exact(width).map(counting).collect(),
+            weight,
             width,
             height,
             origin: (f64::from(area.left) + middle, f64::from(area.top) + middle),
@@ -99,23 +111,47 @@ impl Refiner {
         })
     }
 
-    /// The disparity of all pixels as one, then of its parts; `None` when it runs away.
-    pub fn refine(&self) -> Option<Refined> {
+    /// The disparity of all pixels as one, then of its parts; `None` when it runs away, or when too little of
+    /// the target goes with it.
+    pub fn refine(&self) -> Option<Refinement> {
         let whole = self.together()?;
         let parts = self.parts(&whole);
+        if ((parts.len() * PART * PART) as f64) < LEAST_ALONG * self.counted() {
+            return None;
+        }
         let found = pooled(&parts).unwrap_or(Refined {
             disparity_px: whole.state.x,
             sigma_px: whole.sigma,
             at: whole.at,
         });
-        Some(Refined {
-            disparity_px: found.disparity_px * self.pixel_px + f64::from(self.start_px),
-            sigma_px: found.sigma_px * self.pixel_px,
-            at: (
-                self.origin.0 + found.at.0 * self.pixel_px,
-                self.origin.1 + found.at.1 * self.pixel_px,
-            ),
+        Some(Refinement {
+            found: Refined {
+                disparity_px: found.disparity_px * self.pixel_px + f64::from(self.start_px),
+                sigma_px: found.sigma_px * self.pixel_px,
+                at: (
+                    self.origin.0 + found.at.0 * self.pixel_px,
+                    self.origin.1 + found.at.1 * self.pixel_px,
+                ),
+            },
+            dullness: self.dullness(whole.state.y),
         })
+    }
+
+    /// Places of the raster that count, each by its weight's being there at all.
+    fn counted(&self) -> f64 {
+        self.weight.iter().filter(|weight| **weight > 0.0).count() as f64
+    }
+
+    /// By what share one eye is duller than the other: the squares of their slopes, at equal contrast. The
+    /// whole pixel is near enough for that.
+    fn dullness(&self, gain: f64) -> f64 {
+        let steep = |plane: &[f32]| -> f64 {
+            let slopes = plane.windows(3).zip(&self.weight[1..]);
+            let squares = slopes.map(|(w, weight)| weight * (w[2] - w[0]).powi(2));
+            f64::from(squares.sum::<f32>())
+        };
+        let (left, right) = (steep(&self.left), gain.powi(2) * steep(&self.right));
+        1.0 - left.min(right) / left.max(right).max(f64::MIN_POSITIVE)
     }
 
     /// All that counts.
@@ -163,7 +199,7 @@ impl Refiner {
         for row in tile.rows.clone() {
             let mut lanes = [[0.0_f32; LANES]; TERMS];
             let mut moments = [0.0_f32; LANES];
-            for first in tile.columns.clone().step_by(LANES) {
+            for first in tile.lanes(&self.counting[row]) {
                 let here = row * self.width + first;
                 let left = &self.left[here - 1..here + LANES + 1];
                 let right = here.saturating_add_signed(at.whole);
@@ -277,6 +313,25 @@ struct Tile {
     rows: Range<usize>,
 }
 
+impl Tile {
+    /// First columns of its lanes that may count in a row.
+    fn lanes(&self, counting: &Range<usize>) -> impl Iterator<Item = usize> + use<> {
+        let from = self.columns.start.max(counting.start);
+        (from..self.columns.end.min(counting.end)).step_by(LANES)
+    }
+}
+
+/// Columns of a row of weights from the first to the last that counts, whole lanes from the margin on.
+fn counting(weights: &[f32]) -> Range<usize> {
+    let lane = |column: usize| column.saturating_sub(MARGIN) / LANES;
+    let first = weights.iter().position(|weight| *weight > 0.0);
+    let last = weights.iter().rposition(|weight| *weight > 0.0);
+    match first.zip(last) {
+        Some((first, last)) => MARGIN + lane(first) * LANES..MARGIN + (lane(last) + 1) * LANES,
+        None => MARGIN..MARGIN,
+    }
+}
+
 /// What all pixels together say, on the raster.
 struct Whole {
     state: State,
@@ -347,6 +402,9 @@ const PART: usize = LANES;
 const LEAST_FILLED: f64 = 0.2;
 /// Farthest that a part may be from the whole, on the raster.
 const PART_REACH: f64 = 1.0;
+/// Least share of the target whose parts go with the whole: where fewer do, what was matched is in front of
+/// the target, or not in both eyes.
+const LEAST_ALONG: f64 = 0.25;
 /// Parts that know no more than this count for nothing.
 const WORST_PART: f64 = 1.0;
 /// Fewer parts than this have no scatter to speak of.
@@ -626,7 +684,7 @@ mod tests {
                 *value = 0.7 * *value + 20.0;
             }
             let refiner = Refiner::new(&wave(0.0), &right, &weights(), 6).unwrap();
-            let found = refiner.refine().unwrap();
+            let found = refiner.refine().unwrap().found;
             assert!(
                 (found.disparity_px - truth).abs() < 0.01,
                 "{found:?} {truth}"

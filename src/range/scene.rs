@@ -1,11 +1,15 @@
 //! What all methods look at: one target's surroundings in both eyes, and which pixels are flame.
 
+use super::error::{Matched, Sigma};
 use super::patch::{Area, Colour, Cutter, Gray};
-use super::reach::honest;
 use super::refine::Weights;
-use super::{Disparity, Method, Miss, RangeConfig, RangeError, RawPair, Refusal, Target};
+use super::search::rows_apart;
+use super::{Miss, RangeConfig, RangeError, RawPair, Refusal, Target};
 use crate::detect::DetectionClass;
 use opencv::core::Mat;
+use std::cell::RefCell;
+use std::ops::RangeInclusive;
+use std::rc::Rc;
 
 /// Disparities that are tried, whole pixels, both ends included.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -15,6 +19,16 @@ pub(super) struct Search {
 }
 
 impl Search {
+    /// What the right eye may show of an area.
+    pub fn strip(self, area: &Area) -> Area {
+        area.grown(self.greatest.max(0), (-self.least).max(0), 0)
+    }
+
+    /// Columns from the left eye to the right one, nearest first.
+    pub fn offsets(self) -> RangeInclusive<i32> {
+        -self.greatest..=-self.least
+    }
+
     pub fn all(self) -> impl Iterator<Item = i32> {
         self.least..=self.greatest
     }
@@ -50,11 +64,14 @@ impl Mask {
             wide[row * width + column.saturating_sub(reach)..=row * width + last].fill(true);
         }
         let mut kept = vec![false; self.kept.len()];
-        for row in 0..height {
-            let reached = row.saturating_sub(reach)..=(row + reach).min(height - 1);
-            for near in reached {
-                for column in 0..width {
-                    kept[near * width + column] |= wide[row * width + column];
+        for (row, line) in wide.chunks_exact(width.max(1)).enumerate() {
+            if !line.contains(&true) {
+                continue;
+            }
+            for near in row.saturating_sub(reach)..=(row + reach).min(height - 1) {
+                let into = &mut kept[near * width..(near + 1) * width];
+                for (kept, wide) in into.iter_mut().zip(line) {
+                    *kept |= wide;
                 }
             }
         }
@@ -102,8 +119,10 @@ impl Mask {
     }
 }
 
-/// Surroundings of the target that matching may touch.
-const AROUND_PX: i32 = 10;
+/// Surroundings of the target that matching may touch: columns and rows.
+const AROUND_PX: (i32, i32) = (10, 6);
+/// Offsets that differ by no more than this are served by one cut.
+const SAME_PLACE_PX: i32 = 2;
 /// Least weight of a pixel about the flame.
 const FAINTEST: f32 = 0.1;
 
@@ -114,17 +133,24 @@ pub(super) struct Scene<'a> {
     /// The box, rectified.
     pub target: Area,
     /// The box and its context.
-    pub left: Colour,
-    /// The same rows of the right eye, as far as the search reaches, good to whole pixels.
+    pub context: Area,
+    /// The box and a little around in the left eye, exactly.
+    pub left: Gray,
+    /// The same rows of the right eye, as far as the search reaches, good to whole pixels; only rows `every`
+    /// apart are filled.
     pub right: Gray,
+    /// Which rows are compared to find whole pixels: all, every second one, and so on.
+    pub every: i32,
     pub right_gray: &'a Mat,
-    /// The flame, over the left eye's area.
+    /// The flame, over the box and its context.
     pub flame: Mask,
     /// How far each of its pixels outshines the surroundings, 0 to 1: the less, the more shows through.
     pub shine: Vec<f32>,
     pub search: Search,
-    /// Of the rectified pair, pixels.
-    pub focal_px: f64,
+    /// Whether the right eye sees near infrared.
+    pub two_spectra: bool,
+    /// The right eye where it was last looked at exactly.
+    exact: RefCell<Option<(i32, Rc<Gray>)>>,
 }
 
 impl<'a> Scene<'a> {
@@ -147,27 +173,35 @@ impl<'a> Scene<'a> {
         };
         let context = config.context_px as i32;
         let around = area.grown(context, context, context);
-        let left = cutter.left(&pair.left_bgr, around)?;
-        let strip = around.grown(search.greatest.max(0), (-search.least).max(0), 0);
-        let right = cutter.right_draft(right_gray, strip)?;
-        let (flame, shine) = flame(&left, &area, config);
+        let colour = cutter.left(&pair.left_bgr, around)?;
+        let (flame, shine) = flame(&colour, &area, config);
+        let every = rows_apart(&flame.runs());
+        let near = nearby(&area);
+        let strip = search.strip(&near);
+        let right = cutter.right_draft(right_gray, strip, every)?;
         Ok(Self {
             cutter,
             left_bgr: &pair.left_bgr,
             target: area,
-            left,
+            context: colour.area,
+            left: cutter.left_gray(&pair.left_bgr, near)?,
             right,
+            every,
             right_gray,
             flame,
             shine,
             search,
-            focal_px: cutter.focal_px(),
+            two_spectra: cutter.two_spectra(),
+            exact: RefCell::default(),
         })
     }
 
-    /// A method's disparity with the sigma that its errors truly have.
-    pub fn honest(&self, method: Method, found: &Disparity) -> Disparity {
-        honest(method, found, self.target.width(), self.focal_px)
+    /// What the error of a method's disparity comes to for this target.
+    pub fn sigma(&self, matched: &Matched) -> Sigma {
+        let width_px = self.target.width() as f64;
+        // A flame is about as deep as it is wide: this much disparity its depth spans.
+        let depth_px = self.cutter.beyond_infinity_px(matched.found.px) * width_px;
+        matched.sigma(width_px, depth_px.abs() / self.cutter.focal_px())
     }
 
     /// How much the pixels about the flame count: as they outshine what is behind, and a little where
@@ -181,24 +215,39 @@ impl<'a> Scene<'a> {
         }
     }
 
+    /// All rows of the right eye, as far as the search reaches, good to whole pixels.
+    pub fn right_whole(&self) -> Result<Gray, RangeError> {
+        self.cutter.right_draft(self.right_gray, self.right.area, 1)
+    }
+
     /// What the right eye shows `offset` columns from where the target is, exactly, and a little around.
-    pub fn opposite(&self, offset: i32) -> Result<Gray, RangeError> {
-        let area = self.target.grown(AROUND_PX, AROUND_PX, AROUND_PX);
-        let area = area.grown(-offset, offset, 0);
-        self.cutter.right(self.right_gray, area)
+    /// Methods mostly ask for the same place.
+    pub fn opposite(&self, offset: i32) -> Result<Rc<Gray>, RangeError> {
+        if let Some((there, gray)) = &*self.exact.borrow()
+            && (there - offset).abs() <= SAME_PLACE_PX
+        {
+            return Ok(Rc::clone(gray));
+        }
+        let area = nearby(&self.target).grown(-offset, offset, 0);
+        let gray = Rc::new(self.cutter.right(self.right_gray, area)?);
+        *self.exact.borrow_mut() = Some((offset, Rc::clone(&gray)));
+        Ok(gray)
     }
 
     /// The left eye as far as what the right one shows `offset` columns on may come from there.
     /// In rows `every` apart.
-    pub fn back(&self, offset: i32, every: i32) -> Result<Gray, RangeError> {
-        let area = self.target.grown(AROUND_PX, AROUND_PX, AROUND_PX);
-        let area = area.grown(
+    pub fn back(&self, offset: i32) -> Result<Gray, RangeError> {
+        let area = nearby(&self.target).grown(
             -offset - self.search.least,
             offset + self.search.greatest,
             0,
         );
-        self.cutter.left_draft(self.left_bgr, area, every)
+        self.cutter.left_draft(self.left_bgr, area, self.every)
     }
+}
+
+fn nearby(target: &Area) -> Area {
+    target.grown(AROUND_PX.0, AROUND_PX.0, AROUND_PX.1)
 }
 
 /// The flame's pixels in the box and how far they outshine the surroundings: those that the gate keeps
@@ -206,7 +255,7 @@ impl<'a> Scene<'a> {
 /// gate keeps; where that is too little as well (a thing in colours that the gate does not know), all
 /// of them, and all alike.
 fn flame(left: &Colour, target: &Area, config: &RangeConfig) -> (Mask, Vec<f32>) {
-    let area = left.gray.area;
+    let area = left.area;
     let shines: Vec<i16> = left.bgr.iter().map(|pixel| shine(*pixel)).collect();
     let floor = brightness_around(&shines, &area, target);
     let width = area.width();

@@ -1,6 +1,6 @@
 //! Normalised correlation of a target with every place that it may be seen at in the other eye.
 
-use super::patch::Gray;
+use super::patch::{Area, Gray};
 use super::scene::Run;
 
 /// Correlation by offset, whole pixels; not a number where too little overlaps or nothing varies.
@@ -42,15 +42,14 @@ pub(super) fn correlate(
         .copied()
         .collect();
     let own = Own::of(one, &runs);
+    let rows = Rows::of(other, &runs);
     let mut offsets = offsets.peekable();
     Curve {
         least: offsets.peek().copied().unwrap_or_default(),
         values: offsets
             .map(|offset| {
                 if own.is_whole_at(other, offset) {
-                    own.sums
-                        .with_others(one, other, &runs, offset)
-                        .correlation(own.sums.n)
+                    own.with(&rows, &runs, offset).correlation(own.sums.n)
                 } else {
                     at_edge(one, other, &runs, offset, own.sums.n)
                 }
@@ -63,22 +62,95 @@ pub(super) fn correlate(
 struct Own {
     sums: Sums,
     columns: (i32, i32),
+    /// The runs' grey levels about the middle one, one after the other.
+    levels: Vec<f32>,
 }
 
 impl Own {
     fn of(one: &Gray, runs: &[Run]) -> Self {
         let mut sums = Sums::default();
         let mut columns = (i32::MAX, i32::MIN);
+        let mut levels = Vec::new();
         for run in runs {
             columns = (columns.0.min(run.from), columns.1.max(run.to));
             let pixels = cut(one, run, 0);
             sums.take(pixels, pixels);
+            levels.extend(pixels.iter().map(|level| level - MIDDLE));
         }
-        Self { sums, columns }
+        Self {
+            sums,
+            columns,
+            levels,
+        }
     }
 
     fn is_whole_at(&self, other: &Gray, offset: i32) -> bool {
         self.columns.0 + offset >= other.seen.0 && self.columns.1 + offset <= other.seen.1
+    }
+
+    fn with(&self, rows: &Rows, runs: &[Run], offset: i32) -> Sums {
+        let (mut y, mut yy, mut xy) = (0.0, 0.0, 0.0);
+        let mut own = &self.levels[..];
+        for run in runs {
+            let (here, rest) = own.split_at((run.to - run.from) as usize);
+            own = rest;
+            let first = rows.place(run.row, run.from + offset);
+            let last = first + here.len();
+            y += rows.sums[last].0 - rows.sums[first].0;
+            yy += rows.sums[last].1 - rows.sums[first].1;
+            xy += product(here, &rows.levels[first..last]);
+        }
+        Sums {
+            y,
+            yy,
+            xy,
+            ..self.sums
+        }
+    }
+}
+
+/// The other eye's rows that are compared: grey levels about the middle one, and their running sums, so that
+/// mean and variance of any run cost two look-ups.
+struct Rows {
+    area: Area,
+    levels: Vec<f32>,
+    /// Of the levels and of their squares before each place; a row has one place more than columns.
+    sums: Vec<(f64, f64)>,
+}
+
+impl Rows {
+    fn of(gray: &Gray, runs: &[Run]) -> Self {
+        let area = gray.area;
+        let wide = area.width() + 1;
+        let mut rows = Self {
+            area,
+            levels: vec![0.0; wide * area.height()],
+            sums: vec![(0.0, 0.0); wide * area.height()],
+        };
+        let mut done = None;
+        for run in runs
+            .iter()
+            .filter(|run| (area.top..area.bottom).contains(&run.row))
+        {
+            if done.replace(run.row) == Some(run.row) {
+                continue;
+            }
+            let first = rows.place(run.row, area.left);
+            let (mut sum, mut squares) = (0.0, 0.0);
+            for (k, level) in gray.row(run.row).iter().enumerate() {
+                let level = level - MIDDLE;
+                rows.levels[first + k] = level;
+                sum += f64::from(level);
+                squares += f64::from(level * level);
+                rows.sums[first + k + 1] = (sum, squares);
+            }
+        }
+        rows
+    }
+
+    fn place(&self, row: i32, column: i32) -> usize {
+        (row - self.area.top) as usize * (self.area.width() + 1)
+            + (column - self.area.left) as usize
     }
 }
 
@@ -139,29 +211,6 @@ impl Sums {
         self.xy += xy;
     }
 
-    /// The same own pixels with those that another eye shows.
-    fn with_others(mut self, one: &Gray, other: &Gray, runs: &[Run], offset: i32) -> Self {
-        (self.y, self.yy, self.xy) = (0.0, 0.0, 0.0);
-        for run in runs {
-            let (xs, ys) = (cut(one, run, 0), cut(other, run, offset));
-            let mut lanes = [[0.0_f32; LANES]; 3];
-            let (x_chunks, y_chunks) = (xs.chunks_exact(LANES), ys.chunks_exact(LANES));
-            for (x, y) in x_chunks.remainder().iter().zip(y_chunks.remainder()) {
-                add_other(&mut lanes, 0, *x, *y);
-            }
-            for (x, y) in x_chunks.zip(y_chunks) {
-                for k in 0..LANES {
-                    add_other(&mut lanes, k, x[k], y[k]);
-                }
-            }
-            let [y, yy, xy] = lanes.map(|lane| f64::from(lane.iter().sum::<f32>()));
-            self.y += y;
-            self.yy += yy;
-            self.xy += xy;
-        }
-        self
-    }
-
     fn correlation(&self, wanted: f64) -> f64 {
         let n = self.n;
         let (spread_x, spread_y) = (self.xx - self.x * self.x / n, self.yy - self.y * self.y / n);
@@ -183,12 +232,18 @@ fn add(lanes: &mut [[f32; LANES]; 5], k: usize, x: f32, y: f32) {
     lanes[4][k] += x * y;
 }
 
-#[inline]
-fn add_other(lanes: &mut [[f32; LANES]; 3], k: usize, x: f32, y: f32) {
-    let (x, y) = (x - MIDDLE, y - MIDDLE);
-    lanes[0][k] += y;
-    lanes[1][k] += y * y;
-    lanes[2][k] += x * y;
+/// Sum of products, lanes side by side.
+fn product(xs: &[f32], ys: &[f32]) -> f64 {
+    let (x_chunks, y_chunks) = (xs.chunks_exact(LANES), ys.chunks_exact(LANES));
+    let rest = x_chunks.remainder().iter().zip(y_chunks.remainder());
+    let rest: f32 = rest.map(|(x, y)| x * y).sum();
+    let mut lanes = [0.0_f32; LANES];
+    for (x, y) in x_chunks.zip(y_chunks) {
+        for k in 0..LANES {
+            lanes[k] += x[k] * y[k];
+        }
+    }
+    f64::from(rest + lanes.iter().sum::<f32>())
 }
 
 impl Curve {
@@ -214,7 +269,6 @@ impl Curve {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::range::patch::Area;
 
     fn gray(values: Vec<f32>) -> Gray {
         Gray {

@@ -1,9 +1,10 @@
 //! Semi-global matching per pixel in the padded box, pooled under the flame's mask (P3, P4).
 
+use super::error::{Factors, Matched};
 use super::patch::Gray;
 use super::pool::{Pooled, Sample, pool};
 use super::scene::{Mask, Scene, Search};
-use super::search::{correlate, rows_apart};
+use super::search::correlate;
 use super::{Disparity, Miss, RangeConfig, RangeError, Refusal};
 use emberfix_calib::RectifiedPixel;
 use opencv::calib3d::{StereoSGBM, StereoSGBM_MODE_SGBM};
@@ -26,7 +27,7 @@ impl SemiGlobal {
         })
     }
 
-    pub fn find(&mut self, scene: &Scene<'_>) -> Result<Disparity, Miss> {
+    pub fn find(&mut self, scene: &Scene<'_>) -> Result<Matched, Miss> {
         let samples = self.samples(scene)?;
         let covered = samples.len() as f64 / scene.flame.count().max(1) as f64;
         if covered < LEAST_COVERED {
@@ -41,21 +42,26 @@ impl SemiGlobal {
             return Err(Refusal::Inconsistent.into());
         }
         borne_out(scene, &samples, &pooled, config)?;
-        let sigma_px = UNSETTLED_PX * (1.0 - pooled.agreement);
-        Ok(Disparity {
+        let found = Disparity {
             px: pooled.disparity_px,
-            sigma_px,
+            sigma_px: UNSETTLED_PX * (1.0 - pooled.agreement),
             support: pooled.support,
             centroid: RectifiedPixel {
                 u: pooled.centroid.0,
                 v: pooled.centroid.1,
             },
+        };
+        Ok(Matched {
+            found,
+            likeness: 1.0,
+            dullness: 0.0,
+            factors: &FACTORS,
         })
     }
 
     /// Every valid disparity under the mask.
     fn samples(&mut self, scene: &Scene<'_>) -> Result<Vec<Sample>, RangeError> {
-        let strip = scene.right.area;
+        let strip = scene.search.strip(&scene.context);
         let left = scene.cutter.left_gray(scene.left_bgr, strip)?;
         let right = scene.cutter.right(scene.right_gray, strip)?;
         let mut disparities = Mat::default();
@@ -82,6 +88,12 @@ impl SemiGlobal {
 /// Pixels of error, one sigma, if no two pixels agreed. Neighbours share their errors, so that the spread
 /// of those that agree says little; how many do not agree says more.
 const UNSETTLED_PX: f64 = 1.7;
+/// How its error follows from that: whole pixels pull at its disparities, whatever agrees.
+const FACTORS: Factors = Factors {
+    scatter: 1.0,
+    unlike: (0.0, 0.0),
+    least_px: 0.12,
+};
 /// Share of the flame that must have a valid disparity: where less has, the eyes show it differently.
 const LEAST_COVERED: f64 = 0.5;
 /// Least correlation of what was matched: no gain or offset is made up for pixel by pixel.
@@ -109,8 +121,7 @@ fn borne_out(
     let middle = -pooled.disparity_px.round() as i32;
     let offsets = (middle - 2).max(-scene.search.greatest)..=(middle + 2).min(-scene.search.least);
     let runs = matched.runs();
-    let every = rows_apart(&runs);
-    let curve = correlate(&scene.left.gray, &scene.right, &runs, every, offsets);
+    let curve = correlate(&scene.left, &scene.right, &runs, scene.every, offsets);
     let best = curve.values.into_iter().fold(f64::NAN, f64::max);
     if best >= LEAST_LIKENESS.max(config.min_correlation) {
         Ok(())

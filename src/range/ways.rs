@@ -5,8 +5,8 @@ use super::reach::Reach;
 use super::scene::{Scene, Search};
 use super::sgbm::SemiGlobal;
 use super::{
-    Method, Methods, Miss, RangeConfig, RangeError, Ranger, Ranging, RawPair, Target, best,
-    centroid, correlate, cross_spectral,
+    Disparity, Method, Methods, Miss, RangeConfig, RangeError, Ranger, Ranging, RawPair, Target,
+    best, centroid, correlate, cross_spectral,
 };
 use emberfix_calib::Rig;
 
@@ -48,13 +48,17 @@ impl Ways {
         let (found, used) = match self.method {
             Method::Best => best::find(&scene, config)?,
             method => {
-                let found = match method {
+                let matched = match method {
                     Method::Sgbm => self.semi_global.find(&scene)?,
                     Method::Centroid => centroid::find(&scene, config)?,
                     Method::CrossSpectral => cross_spectral::find(&scene, config)?,
-                    Method::Correlate | Method::Best => correlate::find(&scene, config)?.found,
+                    Method::Correlate | Method::Best => correlate::find(&scene, config)?,
                 };
-                (scene.honest(method, &found), Methods::only(method))
+                let found = Disparity {
+                    sigma_px: scene.sigma(&matched).px(),
+                    ..matched.found
+                };
+                (found, Methods::only(method))
             }
         };
         Ok(self.reach.judge(&found, used))

@@ -72,7 +72,6 @@ impl Hardness {
             exposure: 0.8..1.6,
             wind_m_s: 0.0..2.0,
             indoors: false,
-            near_infrared: false,
             hardness: Some(self),
         };
         match self {

@@ -1,8 +1,9 @@
 //! What each method does with flames that are hard to range.
 
 use super::cases::Hardness;
-use super::outcome::{BEST, Bench, FULL_FRAME, NAMES, Round, Verdict};
+use super::outcome::{BEST, Bench, FULL_FRAME, NAMES, Round, Said, Verdict};
 use super::stage::{RigName, Stage};
+use super::stats::rms;
 use super::tables::rounds;
 use super::{Options, RangeEvalError, Tick};
 use crate::eval::Table;
@@ -25,6 +26,8 @@ pub(super) struct Count {
     pub refused: usize,
     pub phantom_near: usize,
     pub other_wrong: usize,
+    /// Root mean square of error over stated sigma, of weak disparities too.
+    pub normalised_error: Option<f64>,
 }
 
 /// Runs every case on both short baselines.
@@ -68,9 +71,12 @@ impl Suite {
             let is = |round: &&Round| round.said[method].verdict == verdict;
             self.rounds.iter().filter(is).count()
         });
+        let said = self.rounds.iter().map(|round| &round.said[method]);
+        let sigmas: Vec<f64> = said.filter_map(Said::off_sigmas).collect();
         Count {
             case: self.case,
             method: NAMES[method],
+            normalised_error: rms(&sigmas),
             of: self.rounds.len(),
             right,
             refused,
@@ -109,6 +115,7 @@ impl Suite {
 pub(super) fn drawn(suites: &[Suite]) -> Table {
     let mut header = vec!["case".to_owned(), "rounds".to_owned()];
     header.extend(NAMES.map(str::to_owned));
+    header.push(format!("{}: error / sigma", NAMES[BEST]));
     let row = |suite: &Suite| {
         let mut row = vec![suite.case.name().to_owned(), suite.rounds.len().to_string()];
         row.extend(suite.counts().iter().map(|count| {
@@ -121,6 +128,8 @@ pub(super) fn drawn(suites: &[Suite]) -> Table {
             } = count;
             format!("{right} / {refused} / {phantom_near} / {other_wrong}")
         }));
+        let normalised = suite.count(BEST).normalised_error;
+        row.push(normalised.map_or("-".to_owned(), |value| format!("{value:.2}")));
         row
     };
     Table {

@@ -5,9 +5,8 @@
 //! **In:** [`Options`]: a seed, how many flames, and which set of them. **Out:** [`Report`].
 //!
 //! **Truth.** Flames are rendered by the simulator's studio as both raw eyes see them, through their
-//! own lenses. Ranges are held against the depth at which the flame stands, disparities and sigmas
-//! against what the left eye truly sees of it: the mean over its pixels of the light-weighted
-//! reciprocal depth, at the row of the answer's centroid.
+//! own lenses. Ranges, disparities and sigmas are held against the flame's upright axis, through its base,
+//! at the row of the answer's centroid: that is what the estimator takes a disparity for.
 //! **Two sets.** Methods may be tuned on [`SeedSet::Tuning`]; [`SeedSet::Report`] has other seeds,
 //! shapes, gains and lenses, and is what is reported.
 //! **Known limits.** Rendered flames are the simulator's. Calibration is perfect here: what it leaves
@@ -24,6 +23,7 @@ mod stage;
 mod stats;
 mod subpixel;
 mod tables;
+mod takeover;
 #[cfg(test)]
 mod tests;
 
@@ -39,6 +39,7 @@ use hardness::Suite;
 use middlebury::Scene;
 use outcome::{BEST, FULL_FRAME, NAMES, OURS, Round};
 use speed::Speed;
+use stage::RigName;
 use stats::{mean, rms};
 use subpixel::Step;
 use tables::{Line, Measured};
@@ -288,7 +289,7 @@ impl Findings {
         let rounds = self
             .tables
             .iter()
-            .filter(|table| !table.series.near_infrared)
+            .filter(|table| table.series.rig != RigName::P4Infrared)
             .flat_map(|table| &table.cells)
             .flat_map(|c| &c.rounds);
         let (ours, theirs): (Vec<f64>, Vec<f64>) = rounds
@@ -332,6 +333,22 @@ impl Findings {
         self.tables.iter().flat_map(of).collect()
     }
 
+    /// By how much the light of a flame lies before its axis, in widths: what the methods take for the depth's
+    /// share of their sigma.
+    fn light_before_axis(&self) -> Vec<serde_json::Value> {
+        let of = |table: &Measured| {
+            let rounds = table.cells.iter().flat_map(|cell| &cell.rounds);
+            let before: Vec<f64> = rounds.map(|round| round.truth.light_before()).collect();
+            serde_json::json!({
+                "table": table.series.name,
+                "mean_widths": mean(&before),
+                "rms_widths": rms(&before),
+                "n": before.len(),
+            })
+        };
+        self.tables.iter().map(of).collect()
+    }
+
     fn details(&self, options: &Options) -> serde_json::Value {
         let per_method = |method: usize| {
             serde_json::json!({
@@ -349,6 +366,7 @@ impl Findings {
             "repeats": options.repeats,
             "methods": (0..OURS).map(per_method).collect::<Vec<_>>(),
             "honesty": self.honesty(),
+            "light_before_axis": self.light_before_axis(),
             "ranges": lines,
             "hard_flames": counts,
             "subpixel": self.steps,

@@ -4,7 +4,6 @@ use super::RangeEvalError;
 use super::papers::FullFrame;
 use super::stage::{Stage, Trial, Truth};
 use crate::range::{Method, RangeConfig, Ranger, Ranging, open};
-use emberfix_calib::{Eye, RectifiedPixel};
 use std::sync::Mutex;
 
 /// Who measures: our methods, and the papers' two readings of full-frame matching.
@@ -142,13 +141,13 @@ impl<'a> Bench<'a> {
                 centroid,
                 ..
             } => {
-                let truth_px = truth.disparity_px(self.row(centroid));
+                let truth_px = truth.disparity_px(centroid.v);
                 Said::new(Some((disparity_px, sigma_px)), true, truth_px, truth)
             }
             Ranging::BeyondReach {
                 at_least_m, weak, ..
             } => {
-                let truth_px = truth.disparity_px(self.row(weak.centroid));
+                let truth_px = truth.disparity_px(weak.centroid.v);
                 let said = Said::new(Some((weak.px, weak.sigma_px)), false, truth_px, truth);
                 // "At least" is meant at two sigmas; a tenth beyond it is a claim that is wrong.
                 let wrong = at_least_m > 1.1 * truth.depth_m(truth_px);
@@ -165,10 +164,6 @@ impl<'a> Bench<'a> {
                 Said::new(None, false, truth.disparity_px(truth.row()), truth)
             }
         }
-    }
-
-    fn row(&self, pixel: RectifiedPixel) -> f64 {
-        self.stage.rig.rectification().unrectify(Eye::Left, pixel).v
     }
 }
 

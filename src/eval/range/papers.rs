@@ -25,7 +25,7 @@ pub(super) struct FullFrame {
 }
 
 /// What the papers' readings give for one box.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Reading {
     /// P3: mean of the valid disparities under its mask.
     pub masked_px: Option<f64>,
@@ -33,7 +33,7 @@ pub(super) struct Reading {
     pub single_px: Option<f64>,
     /// Better than either printed: the median of the valid disparities under our own mask.
     pub median_px: Option<f64>,
-    /// Row of the box's middle in the raw left image.
+    /// Row of the box's middle in the rectified left image.
     pub row: f64,
 }
 
@@ -79,15 +79,12 @@ impl FullFrame {
         pair: &RawPair,
         box_px: &BoxPx,
     ) -> Result<Reading, RangeEvalError> {
-        let row = box_px.centre().1;
-        let nothing = Reading {
-            masked_px: None,
-            single_px: None,
-            median_px: None,
-            row,
-        };
         let Some(target) = self.rectified(box_px)? else {
-            return Ok(nothing);
+            return Ok(Reading::default());
+        };
+        let nothing = Reading {
+            row: f64::from(target.y) + 0.5 * f64::from(target.height),
+            ..Reading::default()
         };
         let part = self.around(target);
         let Some((disparities, left_bgr)) = self.matched(pair, part)? else {
@@ -107,7 +104,7 @@ impl FullFrame {
                 inside.x + inside.width / 2,
                 inside.y + inside.height / 2,
             )?,
-            row,
+            ..nothing
         })
     }
 

@@ -135,7 +135,6 @@ fn many(stage: &Stage, options: &Options) -> Result<(RawPair, Vec<Target>), Rang
             exposure: 0.8..1.4,
             wind_m_s: 0.0..1.0,
             indoors: false,
-            near_infrared: false,
             hardness: None,
         };
         let Some(trial) =

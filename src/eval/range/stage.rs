@@ -3,7 +3,7 @@
 use super::RangeEvalError;
 use crate::detect::{BoxPx, DetectionClass};
 use crate::range::{RawPair, Target};
-use emberfix_calib::{Eye, RectifiedPixel, Rig};
+use emberfix_calib::{Eye, RawPixel, RectifiedPixel, Rig, RigError};
 use emberfix_frames::{Metres, ServiceTime};
 use emberfix_sim::noise::{normal, stream};
 use emberfix_sim::render::studio::{Backdrop, Branch, Look, Puff, Seen, Shot, Studio, StudioFire};
@@ -42,6 +42,8 @@ pub(super) struct Stage {
 pub(super) enum RigName {
     P1,
     P4,
+    /// The same with a near-infrared right eye.
+    P4Infrared,
     Ours75,
     Ours120,
     Ours500,
@@ -60,7 +62,6 @@ pub(super) struct Recipe {
     pub exposure: Range<f64>,
     pub wind_m_s: Range<f64>,
     pub indoors: bool,
-    pub near_infrared: bool,
     pub hardness: Option<super::cases::Hardness>,
 }
 
@@ -71,14 +72,19 @@ pub(super) struct Trial {
     pub truth: Truth,
 }
 
-/// Where the flame truly is.
+/// Where the flame truly stands: its upright axis, through its base, in the rectified left camera.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Truth {
-    seen: Seen,
+    /// Base and the way up (of unit length): right, down, along the boresight.
+    base_m: Vector3<f64>,
+    up: Vector3<f64>,
+    height_m: f64,
+    focal_px: f64,
+    middle_row: f64,
     focal_baseline: f64,
     infinity_px: f64,
-    /// Change of the reciprocal depth of what stands upright from row to row, 1/m per raw pixel.
-    slope_per_px: f64,
+    /// By how much the light that the left eye sees lies before the axis, as a share of the flame's width.
+    light_before: f64,
 }
 
 /// How much two sets of flames differ.
@@ -113,20 +119,31 @@ impl SeedSet {
 }
 
 impl RigName {
-    fn text(self) -> &'static str {
-        match self {
+    fn text(self) -> String {
+        let text = match self {
             Self::P1 => include_str!("rigs/p1.toml"),
-            Self::P4 => include_str!("rigs/p4.toml"),
+            Self::P4 | Self::P4Infrared => include_str!("rigs/p4.toml"),
             Self::Ours75 => include_str!("rigs/ours-75mm.toml"),
             Self::Ours120 => include_str!("rigs/ours-120mm.toml"),
             Self::Ours500 => include_str!("rigs/ours-500mm.toml"),
-        }
+        };
+        let right = if self == Self::P4Infrared {
+            "[right]\nnear_infrared = true\n"
+        } else {
+            "[right]\n"
+        };
+        text.replace("[right]\n", right)
+    }
+
+    /// As its file has it.
+    pub(super) fn rig(self) -> Result<Rig, RigError> {
+        Rig::parse(&self.text(), Path::new("the eval's rig"))
     }
 
     /// P1's and P4's nearest flames stand at 120 px, the others' within 96.
     fn num_disparities(self) -> u32 {
         match self {
-            Self::P1 | Self::P4 => 144,
+            Self::P1 | Self::P4 | Self::P4Infrared => 144,
             Self::Ours75 | Self::Ours120 | Self::Ours500 => 96,
         }
     }
@@ -139,7 +156,7 @@ pub(super) fn world() -> Result<Arc<World>, RangeEvalError> {
 
 impl Stage {
     pub(super) fn new(name: RigName, world: &Arc<World>) -> Result<Self, RangeEvalError> {
-        let rig = Rig::parse(name.text(), Path::new("the eval's rig"))?;
+        let rig = name.rig()?;
         Ok(Self {
             studio: Studio::new(world.clone(), StereoCamera::new(&rig)),
             num_disparities: name.num_disparities(),
@@ -166,7 +183,7 @@ impl Stage {
             Some(look) => Some(mat(&self.studio.expose(&set_up.shot, Eye::Right, &look))?),
             None => None,
         };
-        let truth = self.truth(&set_up.shot.fires[0], set_up.depth_m, seen);
+        let truth = self.truth(&set_up.shot.fires[0], &seen)?;
         Ok(Some(Trial {
             pair: RawPair {
                 at: ServiceTime::from_unix_ns(0),
@@ -220,7 +237,7 @@ impl Stage {
         };
         let right = Look {
             gain: left.gain * within(rng, &variety.right_gain),
-            near_infrared: recipe.near_infrared,
+            near_infrared: self.rig.right_near_infrared(),
             blur_px: left.blur_px * rng.random_range(0.9..1.15),
             seed: rng.random(),
             ..left.clone()
@@ -263,44 +280,61 @@ impl Stage {
     /// Rectified left column and row of a point, east, north, up.
     pub(super) fn left_pixel(&self, point_m: Vector3<f64>) -> (f64, f64) {
         let rect = self.rig.rectification();
-        let [x, y, z] =
-            [Vector3::x(), Vector3::y(), Vector3::z()].map(|axis| self.enu(axis).dot(&point_m));
+        let seen_m = self.camera(point_m);
         let (cx, cy) = rect.principal_point_px();
-        (rect.focal_px() * x / z + cx, rect.focal_px() * y / z + cy)
+        (
+            rect.focal_px() * seen_m.x / seen_m.z + cx,
+            rect.focal_px() * seen_m.y / seen_m.z + cy,
+        )
     }
 
     fn boresight(&self) -> Vector3<f64> {
         self.enu(Vector3::z())
     }
 
-    fn truth(&self, fire: &StudioFire, stands_m: f64, seen: Seen) -> Truth {
+    fn truth(&self, fire: &StudioFire, seen: &Seen) -> Result<Truth, RangeEvalError> {
         let rect = self.rig.rectification();
-        let axis = self.boresight();
-        let down = self.enu(Vector3::y());
-        // Upright: a metre up changes the depth by the one and the row by the other.
-        let (depth_per_m, rows_per_m) = (axis.z, down.z * rect.focal_px() / stands_m);
-        let middle_m = fire.base_m + Vector3::z() * (0.5 * fire.height_m);
-        let slant = middle_m.dot(&down) / stands_m;
-        let rows_per_m = rows_per_m - slant * rect.focal_px() / stands_m * depth_per_m;
-        Truth {
-            seen,
+        let mut truth = Truth {
+            base_m: self.camera(fire.base_m),
+            up: self.camera(Vector3::z()),
+            height_m: fire.height_m,
+            focal_px: rect.focal_px(),
+            middle_row: rect.principal_point_px().1,
             focal_baseline: rect.focal_px() * self.rig.baseline_m(),
             infinity_px: rect.infinity_disparity_px(),
-            slope_per_px: -depth_per_m / (stands_m * stands_m) / rows_per_m,
-        }
+            light_before: 0.0,
+        };
+        let [left, _, right, _] = seen.box_px;
+        let light = RawPixel {
+            u: 0.5 * (left + right),
+            v: seen.row,
+        };
+        let row = rect.rectify(Eye::Left, &[light])?[0].v;
+        let axis_m = truth.depth_m(truth.disparity_px(row));
+        truth.light_before = (axis_m - 1.0 / seen.inverse_depth_per_m) / fire.width_m;
+        Ok(truth)
+    }
+
+    /// East, north, up as rectified-camera components.
+    fn camera(&self, enu_m: Vector3<f64>) -> Vector3<f64> {
+        let axes = [Vector3::x(), Vector3::y(), Vector3::z()];
+        Vector3::from(axes.map(|axis| self.enu(axis).dot(&enu_m)))
     }
 }
 
 impl Truth {
-    /// Disparity of what the left eye sees of the flame, at a raw row of the left image.
+    /// Disparity of the flame's axis at a row of the rectified image.
     pub(super) fn disparity_px(&self, row: f64) -> f64 {
-        let inverse = self.seen.inverse_depth_per_m + self.slope_per_px * (row - self.seen.row);
-        self.infinity_px + self.focal_baseline * inverse
+        // (base + h up) shows at the row: its y over its z is the row's tangent.
+        let tangent = (row - self.middle_row) / self.focal_px;
+        let high_m = (tangent * self.base_m.z - self.base_m.y) / (self.up.y - tangent * self.up.z);
+        self.infinity_px + self.focal_baseline / (self.base_m.z + high_m * self.up.z)
     }
 
-    /// Row of the middle of what the left eye sees of the flame.
+    /// Row of the middle of the flame, rectified.
     pub(super) fn row(&self) -> f64 {
-        self.seen.row
+        let middle_m = self.base_m + self.up * (0.5 * self.height_m);
+        self.middle_row + self.focal_px * middle_m.y / middle_m.z
     }
 
     /// Depth that a disparity means.
@@ -310,6 +344,11 @@ impl Truth {
 
     pub(super) fn focal_baseline(&self) -> f64 {
         self.focal_baseline
+    }
+
+    /// By how much the light that the left eye sees lies before the axis, in widths of the flame.
+    pub(super) fn light_before(&self) -> f64 {
+        self.light_before
     }
 }
 
@@ -346,7 +385,8 @@ pub(super) fn within(rng: &mut ChaCha8Rng, range: &Range<f64>) -> f64 {
 
 /// The flame's box as a detector draws it: not quite.
 fn drawn_box(seen: &Seen, rng: &mut ChaCha8Rng) -> BoxPx {
-    let [left, top, right, bottom] = seen.box_px;
+    // Pixel centres stand at whole numbers: a pixel begins half a pixel before.
+    let [left, top, right, bottom] = seen.box_px.map(|edge| edge - 0.5);
     let mut off = |size: f64| (0.8 + 0.02 * size) * normal(rng);
     let (wide, high) = (right - left, bottom - top);
     let (left, right) = (left + off(wide), right + off(wide));

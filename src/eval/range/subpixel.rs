@@ -56,7 +56,6 @@ pub(super) fn measure(
             exposure: 0.8..1.4,
             wind_m_s: 0.0..0.5,
             indoors: false,
-            near_infrared: false,
             hardness: None,
         };
         let found = rounds(&bench, &recipe, options, 0x2000, count)?;

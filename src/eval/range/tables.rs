@@ -2,7 +2,7 @@
 
 use super::outcome::{BEST, Bench, NAMES, Round, Said};
 use super::stage::{Recipe, RigName, Stage};
-use super::stats::{deviation, half_interval95, mean, rms};
+use super::stats::{deviation, half_interval95, mean, median, rms};
 use super::{Options, RangeEvalError, Tick};
 use crate::eval::Table;
 use emberfix_sim::world::World;
@@ -18,7 +18,6 @@ pub(super) struct Series {
     pub printed_percent: &'static [f64],
     width_m: (f64, f64),
     indoors: bool,
-    pub near_infrared: bool,
 }
 
 /// P1's six distances with its printed average error rates.
@@ -29,7 +28,6 @@ pub(super) const P1: Series = Series {
     printed_percent: &[2.16, 2.06, 2.20, 3.15, 4.18, 7.37],
     width_m: (0.05, 0.10),
     indoors: true,
-    near_infrared: false,
 };
 /// P4's eight, with its true errors (checklist E10), two visible eyes.
 pub(super) const P4_VISIBLE: Series = Series {
@@ -39,12 +37,11 @@ pub(super) const P4_VISIBLE: Series = Series {
     printed_percent: &[0.64, 0.45, 0.45, 1.20, 0.12, 3.80, 4.93, 0.45],
     width_m: (0.08, 0.16),
     indoors: true,
-    near_infrared: false,
 };
 /// The same with a near-infrared right eye.
 pub(super) const P4_INFRARED: Series = Series {
     name: "P4 visible + near infrared",
-    near_infrared: true,
+    rig: RigName::P4Infrared,
     ..P4_VISIBLE
 };
 const FAR_M: &[f64] = &[5.0, 10.0, 15.0, 20.0, 30.0, 50.0, 75.0, 100.0];
@@ -55,7 +52,6 @@ const OURS_75: Series = Series {
     printed_percent: &[],
     width_m: (0.6, 1.6),
     indoors: false,
-    near_infrared: false,
 };
 const OURS_120: Series = Series {
     name: "ours, 120 mm",
@@ -107,7 +103,14 @@ pub(super) struct Line {
     pub normalised_error: Option<f64>,
     /// Root mean square of the stated sigmas.
     pub stated_sigma_px: Option<f64>,
+    /// Median of the stated sigmas.
+    pub usual_sigma_px: Option<f64>,
+    /// One sigma of a normal error that has the median of the errors' sizes.
+    pub usual_error_px: Option<f64>,
 }
+
+/// Of a normal distribution: its sigma over the median of its absolute values.
+const MEDIAN_TO_SIGMA: f64 = 1.4826;
 
 impl Series {
     pub(super) fn recipe(&self, distance_m: f64) -> Recipe {
@@ -115,7 +118,7 @@ impl Series {
             depth_m: distance_m..distance_m,
             width_m: self.width_m.0..self.width_m.1,
             u_px: self.columns(),
-            v_px: if self.rig == RigName::P4 {
+            v_px: if self.is_p4() {
                 200.0..290.0
             } else {
                 250.0..470.0
@@ -124,7 +127,6 @@ impl Series {
             exposure: if self.indoors { 0.6..1.2 } else { 0.8..1.6 },
             wind_m_s: if self.indoors { 0.0..0.3 } else { 0.0..2.0 },
             indoors: self.indoors,
-            near_infrared: self.near_infrared,
             hardness: None,
         }
     }
@@ -135,18 +137,18 @@ impl Series {
         self.printed_percent.get(place).copied()
     }
 
-    /// Takes a range to what it would be of the stated distance. A level rig sees all of an upright
-    /// flame at one depth; where it looks down, each row has a depth of its own.
-    fn scale(&self, distance_m: f64, round: &Round, said: &Said) -> f64 {
-        if self.indoors {
-            1.0
-        } else {
-            distance_m / round.truth.depth_m(said.truth_px)
-        }
+    /// Takes a range to what it would be of the stated distance: where a rig looks down, each row of an
+    /// upright flame has a depth of its own.
+    fn scale(distance_m: f64, round: &Round, said: &Said) -> f64 {
+        distance_m / round.truth.depth_m(said.truth_px)
+    }
+
+    fn is_p4(&self) -> bool {
+        matches!(self.rig, RigName::P4 | RigName::P4Infrared)
     }
 
     fn columns(&self) -> std::ops::Range<f64> {
-        if self.rig == RigName::P4 {
+        if self.is_p4() {
             215.0..290.0
         } else {
             400.0..900.0
@@ -229,12 +231,13 @@ impl Cell {
         let ranges: Vec<f64> = said()
             .filter_map(|(round, said)| {
                 let found_m = round.truth.depth_m(said.measured_px()?);
-                Some(found_m * series.scale(self.distance_m, round, said))
+                Some(found_m * Series::scale(self.distance_m, round, said))
             })
             .collect();
         let percent = |range: f64| 100.0 * (range - self.distance_m) / self.distance_m;
         let errors: Vec<f64> = ranges.iter().map(|range| percent(*range).abs()).collect();
         let off: Vec<f64> = said().filter_map(|(_, said)| said.off_px()).collect();
+        let sizes: Vec<f64> = off.iter().map(|off| off.abs()).collect();
         let sigmas: Vec<f64> = said().filter_map(|(_, said)| said.off_sigmas()).collect();
         let stated: Vec<f64> = said()
             .filter_map(|(_, said)| said.disparity.map(|(_, sigma)| sigma))
@@ -254,6 +257,8 @@ impl Cell {
             bias_px: mean(&off),
             normalised_error: rms(&sigmas),
             stated_sigma_px: rms(&stated),
+            usual_sigma_px: median(&stated),
+            usual_error_px: median(&sizes).map(|size| MEDIAN_TO_SIGMA * size),
         }
     }
 }
