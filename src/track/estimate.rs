@@ -17,7 +17,8 @@ use std::sync::Arc;
 pub struct Estimate {
     chart: Chart,
     window: Window,
-    joint: Joint,
+    /// Apart from the rest, which every frame looks at: thousands of fires stay close in memory.
+    joint: Box<Joint>,
     /// When the errors in `joint` are those.
     at: ServiceTime,
     position_m: Vector3<f64>,
@@ -99,7 +100,7 @@ impl Estimate {
             chart: Chart::along(frame.lens, &frame.known.all(), &ray),
             window: Window::new(joint.clone(), now),
             solved_at: joint.fire(),
-            joint,
+            joint: Box::new(joint),
             at: now,
             position_m: *frame.lens.centre(),
             covariance: Matrix3::zeros(),
@@ -253,7 +254,7 @@ impl Estimate {
             scatter: frame.scatter,
         };
         let (joint, when) = self.window.solve(&self.chart, &about, frame.pace, ground);
-        (self.joint, self.at) = (joint, when);
+        (*self.joint, self.at) = (joint, when);
         self.joint.hold(at[INVERSE_DEPTH]);
         if ground.is_some() {
             self.methods.insert(Method::Terrain);

@@ -2,11 +2,12 @@
 
 use super::assign::{Candidate, assign};
 use super::estimate::Frame;
+use super::grid::Grid;
 use super::{Classified, Fire};
-use crate::locate::Predicted;
+use crate::locate::{Predicted, Sighting};
 use emberfix_calib::Eye;
 use emberfix_frames::Vector3;
-use nalgebra::Matrix3;
+use nalgebra::{Matrix2, Matrix3, Vector2};
 
 /// A fire as it should be seen, if anything sees it.
 #[derive(Debug, Clone)]
@@ -81,15 +82,26 @@ pub fn associate(
     sightings: &[Classified],
     frame: &Frame<'_>,
 ) -> Matches {
-    let (within, near) = candidates(glimpses, fires, sightings, frame);
-    let matched = assign(&within, glimpses.len(), ALONE);
-    let mut is_taken = vec![false; glimpses.len()];
-    matched.iter().flatten().for_each(|of| is_taken[*of] = true);
-    let left_over = |(row, matched): (Vec<Candidate>, &Option<usize>)| match matched {
-        Some(_) => Vec::new(),
-        None => row.into_iter().filter(|c| !is_taken[c.column]).collect(),
+    let places: Vec<_> = sightings
+        .iter()
+        .map(|s| (s.sighting.base.u, s.sighting.base.v))
+        .collect();
+    let mut scene = Scene {
+        glimpses,
+        fires,
+        sightings,
+        frame,
+        grid: Grid::new(frame.view.rig.camera(Eye::Left).image_size_px, &places),
+        is_open: (vec![true; glimpses.len()], vec![true; sightings.len()]),
     };
-    let near: Vec<_> = near.into_iter().zip(&matched).map(left_over).collect();
+    let within = scene.candidates(GATE[1], |fit| fit.cost);
+    let matched = assign(&within, glimpses.len(), ALONE);
+    for (index, of) in matched.iter().enumerate() {
+        if let Some(of) = of {
+            (scene.is_open.0[*of], scene.is_open.1[index]) = (false, false);
+        }
+    }
+    let near = scene.candidates(STRAY, |fit| Some(fit.squared));
     let strays = assign(&near, glimpses.len(), STRAY + 1.0);
     let slot = |of: Option<usize>| of.map(|of| glimpses[of].slot);
     Matches {
@@ -98,39 +110,48 @@ pub fn associate(
     }
 }
 
-/// For each sighting the fires within the gate at their costs, and all that are near at their squared
-/// distances.
-fn candidates(
-    glimpses: &[Glimpse],
-    fires: &[Fire],
-    sightings: &[Classified],
-    frame: &Frame<'_>,
-) -> (Vec<Vec<Candidate>>, Vec<Vec<Candidate>>) {
-    let mut within = vec![Vec::new(); sightings.len()];
-    let mut near = within.clone();
-    let mut by_column: Vec<usize> = (0..sightings.len()).collect();
-    let column = |index: &usize| sightings[*index].sighting.base.u;
-    by_column.sort_by(|a, b| column(a).total_cmp(&column(b)));
-    let sigmas = sightings.iter().map(|s| s.sighting.base_sigma_px.0);
-    let widest = sigmas.fold(0.0, f64::max);
-    for (of, glimpse) in glimpses.iter().enumerate() {
-        let variance = glimpse.spread[(0, 0)] + glimpse.new[(0, 0)] + widest * widest;
-        let reach = (STRAY * variance).sqrt();
-        let from = by_column.partition_point(|index| column(index) < glimpse.seen.x - reach);
-        let in_reach = by_column[from..]
-            .iter()
-            .take_while(|index| column(index) <= glimpse.seen.x + reach);
-        for index in in_reach {
-            let fire = &fires[glimpse.slot];
-            let Some(fit) = fit(glimpse, fire, &sightings[*index], frame) else {
-                continue;
-            };
-            let candidate = |cost: f64| Candidate { column: of, cost };
-            near[*index].push(candidate(fit.squared));
-            within[*index].extend(fit.cost.map(candidate));
+/// What is matched in one frame.
+struct Scene<'a> {
+    glimpses: &'a [Glimpse],
+    fires: &'a [Fire],
+    sightings: &'a [Classified],
+    frame: &'a Frame<'a>,
+    /// Of the sightings.
+    grid: Grid,
+    /// Glimpses, and sightings, that are not matched yet.
+    is_open: (Vec<bool>, Vec<bool>),
+}
+
+impl Scene<'_> {
+    /// For each open sighting the open glimpses within a squared distance that have a cost.
+    fn candidates(&self, gate: f64, cost: impl Fn(&Fit) -> Option<f64>) -> Vec<Vec<Candidate>> {
+        let widest = self.widest_px();
+        let mut candidates = vec![Vec::new(); self.sightings.len()];
+        let glimpses = self.glimpses.iter().enumerate();
+        for (of, glimpse) in glimpses.filter(|(of, _)| self.is_open.0[*of]) {
+            let spread = glimpse.spread + glimpse.new;
+            let reach = |axis: usize, px: f64| (gate * (spread[(axis, axis)] + px * px)).sqrt();
+            let at = (glimpse.seen.x, glimpse.seen.y);
+            let near = self.grid.near(at, (reach(0, widest.0), reach(1, widest.1)));
+            for index in near.filter(|index| self.is_open.1[*index]) {
+                let fire = &self.fires[glimpse.slot];
+                let fit = fit(glimpse, fire, &self.sightings[index], gate, self.frame);
+                let cost = fit.and_then(|fit| cost(&fit));
+                candidates[index].extend(cost.map(|cost| Candidate { column: of, cost }));
+            }
         }
+        candidates
     }
-    (within, near)
+
+    /// Largest sigma of a box along columns and along rows, as it is believed, pixels.
+    fn widest_px(&self) -> (f64, f64) {
+        let sigmas = self.sightings.iter().map(|s| s.sighting.base_sigma_px);
+        let (u, v) = sigmas.fold((0.0, 0.0), |(u, v): (f64, f64), sigma| {
+            (u.max(sigma.0), v.max(sigma.1))
+        });
+        let scatter = self.frame.scatter.variance().sqrt();
+        (u * scatter, v * scatter)
+    }
 }
 
 /// How a sighting fits a fire that it is near to.
@@ -141,30 +162,45 @@ struct Fit {
     cost: Option<f64>,
 }
 
-fn fit(glimpse: &Glimpse, fire: &Fire, classified: &Classified, frame: &Frame<'_>) -> Option<Fit> {
+/// How a sighting fits a fire; `None` when it lies beyond a squared distance.
+fn fit(
+    glimpse: &Glimpse,
+    fire: &Fire,
+    classified: &Classified,
+    gate: f64,
+    frame: &Frame<'_>,
+) -> Option<Fit> {
     let sighting = &classified.sighting;
     let (sigma_u, sigma_v) = sighting.base_sigma_px;
-    let spread_of_all = glimpse.spread + glimpse.new;
-    let row = sighting.base.v - glimpse.seen.y;
-    let is_far = row * row > STRAY * (spread_of_all[(1, 1)] + sigma_v * sigma_v);
-    if is_far || fire.class != classified.class {
-        return None;
-    }
-    let (residual, has_disparity) = fire.estimate.left(sighting, frame)?;
-    let gate = GATE[usize::from(has_disparity)];
-    let mut spread = spread_of_all;
     let sigma_d = sighting.disparity.map_or(1.0, |d| d.sigma_px);
     let noise = Vector3::new(sigma_u * sigma_u, sigma_v * sigma_v, sigma_d * sigma_d)
         * frame.scatter.variance();
+    let mut spread = glimpse.spread + glimpse.new + Matrix3::from_diagonal(&noise);
+    if fire.class != classified.class || bearing_distance(glimpse, sighting, &spread)? > gate {
+        return None;
+    }
+    let (residual, has_disparity) = fire.estimate.left(sighting, frame)?;
     if !has_disparity {
         spread.fixed_view_mut::<1, 3>(2, 0).fill(0.0);
         spread.fixed_view_mut::<3, 1>(0, 2).fill(0.0);
+        spread[(2, 2)] = noise.z;
     }
-    let factor = (spread + Matrix3::from_diagonal(&noise)).cholesky()?;
+    let factor = spread.cholesky()?;
     let squared = residual.dot(&factor.solve(&residual));
     let widening = 2.0 * factor.l().diagonal().map(f64::ln).sum() - noise.map(f64::ln).sum();
-    (squared <= STRAY).then_some(Fit {
+    (squared <= gate).then_some(Fit {
         squared,
-        cost: (squared <= gate).then_some(squared + widening.min(MOST_WIDENING)),
+        cost: (squared <= GATE[usize::from(has_disparity)])
+            .then_some(squared + widening.min(MOST_WIDENING)),
     })
+}
+
+/// Squared distance by column and row alone: with the disparity it can only grow.
+fn bearing_distance(glimpse: &Glimpse, sighting: &Sighting, spread: &Matrix3<f64>) -> Option<f64> {
+    let off = Vector2::new(
+        sighting.base.u - glimpse.seen.x,
+        sighting.base.v - glimpse.seen.y,
+    );
+    let spread: Matrix2<f64> = spread.fixed_view::<2, 2>(0, 0).into_owned();
+    Some(off.dot(&spread.cholesky()?.solve(&off)))
 }

@@ -31,6 +31,7 @@ mod assign;
 mod chart;
 mod estimate;
 mod glimpse;
+mod grid;
 mod ground;
 mod joint;
 mod life;
@@ -53,7 +54,6 @@ use emberfix_frames::{Coordinate, Covariance, Metres, MissionEnu, ServiceTime, V
 use estimate::Frame;
 use glimpse::Glimpse;
 use pairs::Pairs;
-use std::collections::BTreeSet;
 use std::sync::Arc;
 
 /// A sighting and what it is said to be.
@@ -279,13 +279,15 @@ impl Tracker {
             }
         }
         let new = self.initiate(&slots, sightings, &frame);
-        let seen: BTreeSet<usize> = slots.iter().chain(&new).copied().flatten().collect();
+        let mut seen = vec![false; self.fires.len()];
+        let both = slots.iter().chain(&new).flatten();
+        both.for_each(|slot| seen[*slot] = true);
         self.solve(&seen, &frame);
         self.note_sightings(&slots, &new, sightings, view);
         self.note_misses(&seen, &glimpses, view);
         self.learn(&seen);
         let outcomes = self.outcomes(&slots, &new);
-        self.merge(&seen, &glimpses, now);
+        self.merge(&seen, &glimpses, view);
         self.forget(now);
         self.shared = Some(SharedErrors::read_off(&self.known, view));
         outcomes
@@ -316,10 +318,10 @@ impl Tracker {
     }
 
     /// Solves the fires that need it most, as far as there is time in a frame for it.
-    fn solve(&mut self, seen: &BTreeSet<usize>, frame: &Frame<'_>) {
-        let need = |slot: &usize| (self.fires[*slot].estimate.need(), *slot);
-        let mut due: Vec<_> = seen
-            .iter()
+    fn solve(&mut self, seen: &[bool], frame: &Frame<'_>) {
+        let need = |slot: usize| (self.fires[slot].estimate.need(), slot);
+        let mut due: Vec<_> = (0..seen.len())
+            .filter(|slot| seen[*slot])
             .map(need)
             .filter(|(need, _)| *need >= 1.0)
             .collect();
@@ -337,12 +339,12 @@ impl Tracker {
 
     /// What the best known fire has learned of the shared errors is what the next one begins with.
     /// Which is best is told by how sure it is, not by what it says, so the choice bends nothing.
-    fn learn(&mut self, seen: &BTreeSet<usize>) {
+    fn learn(&mut self, seen: &[bool]) {
         let teaches =
             |fire: &Fire| fire.is_confirmed() && fire.evidence.hits().is_multiple_of(TEACHES);
-        let taught = seen.iter().map(|slot| &self.fires[*slot]);
-        let taught = taught.filter(|fire| teaches(fire));
-        let taught = taught.map(|fire| fire.estimate.joint().known());
+        let taught = self.fires.iter().zip(seen);
+        let taught = taught.filter(|(fire, is_seen)| **is_seen && teaches(fire));
+        let taught = taught.map(|(fire, _)| fire.estimate.joint().known());
         for known in taught {
             if known.knows_more_than(&self.known) {
                 self.known = known;
@@ -454,11 +456,8 @@ impl Tracker {
         }
     }
 
-    fn note_misses(&mut self, seen: &BTreeSet<usize>, glimpses: &[Glimpse], view: &View<'_>) {
-        for glimpse in glimpses
-            .iter()
-            .filter(|glimpse| !seen.contains(&glimpse.slot))
-        {
+    fn note_misses(&mut self, seen: &[bool], glimpses: &[Glimpse], view: &View<'_>) {
+        for glimpse in glimpses.iter().filter(|glimpse| !seen[glimpse.slot]) {
             let fire = &mut self.fires[glimpse.slot];
             if should_be_seen(fire, glimpse, view) {
                 let azimuth = azimuth(&fire.estimate.position_m(), view);
@@ -484,8 +483,8 @@ impl Tracker {
     }
 
     /// Joins what looks have shown to be one fire (see [`Pairs`]).
-    fn merge(&mut self, seen: &BTreeSet<usize>, glimpses: &[Glimpse], now: ServiceTime) {
-        let ones = self.pairs.look(&self.fires, glimpses, seen, now);
+    fn merge(&mut self, seen: &[bool], glimpses: &[Glimpse], view: &View<'_>) {
+        let ones = self.pairs.look(&self.fires, glimpses, seen, view);
         for (elder, younger) in ones {
             let into = self.fires[elder].id;
             self.fires[younger].merged_into = Some(into);

@@ -2,7 +2,10 @@
 
 use super::Fire;
 use super::glimpse::Glimpse;
+use super::grid::Grid;
 use crate::alarm::{FireId, FireState};
+use crate::locate::View;
+use emberfix_calib::Eye;
 use emberfix_frames::{ServiceTime, seconds};
 use nalgebra::Vector2;
 use std::collections::{BTreeMap, BTreeSet};
@@ -46,14 +49,16 @@ impl Pairs {
         &mut self,
         fires: &[Fire],
         glimpses: &[Glimpse],
-        seen: &BTreeSet<usize>,
-        now: ServiceTime,
+        seen: &[bool],
+        view: &View<'_>,
     ) -> Vec<(usize, usize)> {
+        let now = view.pose.at;
+        let image_px = view.rig.camera(Eye::Left).image_size_px;
         self.note_both_seen(fires, seen, now);
         let mut ones = Vec::new();
-        for (a, b) in near_pairs(fires, glimpses, seen) {
+        for (a, b) in near_pairs(fires, glimpses, seen, image_px) {
             let ids = (fires[a.slot].id, fires[b.slot].id);
-            if seen.contains(&a.slot) && seen.contains(&b.slot) {
+            if seen[a.slot] && seen[b.slot] {
                 self.log_odds
                     .entry(ids)
                     .or_insert_with(|| Odds::unknown(now));
@@ -65,6 +70,7 @@ impl Pairs {
                 ones.push((a.slot, b.slot));
             }
         }
+        ones.sort_unstable();
         ones
     }
 
@@ -83,10 +89,15 @@ impl Pairs {
     }
 
     /// Known pairs of which both are seen at once, unless that was settled long ago.
-    fn note_both_seen(&mut self, fires: &[Fire], seen: &BTreeSet<usize>, now: ServiceTime) {
-        let seen: BTreeSet<FireId> = seen.iter().map(|slot| fires[*slot].id).collect();
-        let both = |(a, b): &(FireId, FireId)| seen.contains(a) && seen.contains(b);
-        for (_, odds) in self.log_odds.iter_mut().filter(|(pair, _)| both(pair)) {
+    fn note_both_seen(&mut self, fires: &[Fire], seen: &[bool], now: ServiceTime) {
+        let ids = fires.iter().zip(seen).filter(|(_, is_seen)| **is_seen);
+        // In order, as the fires are.
+        let ids: Vec<FireId> = ids.map(|(fire, _)| fire.id).collect();
+        let is_seen = |id: &FireId| ids.binary_search(id).is_ok();
+        let both = |(a, b): &(FireId, FireId)| is_seen(a) && is_seen(b);
+        let open = self.log_odds.iter_mut();
+        let open = open.filter(|(_, odds)| odds.for_one > SURELY_TWO);
+        for (_, odds) in open.filter(|(pair, _)| both(pair)) {
             odds.add(BOTH_SEEN, now);
         }
     }
@@ -141,47 +152,49 @@ fn are_one_place(a: &Fire, b: &Fire) -> bool {
 fn near_pairs<'a>(
     fires: &[Fire],
     glimpses: &'a [Glimpse],
-    seen: &BTreeSet<usize>,
+    seen: &[bool],
+    image_px: (u32, u32),
 ) -> Vec<(&'a Glimpse, &'a Glimpse)> {
     let open: Vec<&'a Glimpse> = glimpses
         .iter()
         .filter(|glimpse| fires[glimpse.slot].state != FireState::Out)
         .collect();
     let asks = |glimpse: &Glimpse| {
-        !seen.contains(&glimpse.slot) || fires[glimpse.slot].evidence.hits() < SETTLED_LOOKS
+        !seen[glimpse.slot] || fires[glimpse.slot].evidence.hits() < SETTLED_LOOKS
     };
-    let mut by_column = open.clone();
-    by_column.sort_by(|a, b| a.seen.x.total_cmp(&b.seen.x));
-    let widest = open
+    let places: Vec<_> = open.iter().map(|g| (g.seen.x, g.seen.y)).collect();
+    let grid = Grid::new(image_px, &places);
+    let reaches: Vec<_> = open.iter().map(|g| reach_px(g, fires)).collect();
+    let widest = reaches
         .iter()
-        .map(|g| reach_px(g, fires).x)
-        .fold(0.0, f64::max);
-    let mut pairs = BTreeMap::new();
-    for glimpse in open.iter().filter(|glimpse| asks(glimpse)) {
-        let own = reach_px(glimpse, fires);
-        let reach = (own.x + widest).min(NEAR_PX);
-        let from = by_column.partition_point(|other| other.seen.x < glimpse.seen.x - reach);
-        let near = by_column[from..]
-            .iter()
-            .take_while(|other| other.seen.x <= glimpse.seen.x + reach)
-            .filter(|other| {
-                let (off, reach) = (other.seen - glimpse.seen, own + reach_px(other, fires));
-                off.x.abs() <= reach.x && off.y.abs() <= reach.y.min(NEAR_PX)
-            });
-        for other in near.filter(|other| other.slot != glimpse.slot) {
-            let (a, b) = (glimpse.slot, other.slot);
-            let one_seen = seen.contains(&a) || seen.contains(&b);
-            if one_seen && fires[a].class == fires[b].class {
-                let pair = if a < b {
-                    (*glimpse, *other)
-                } else {
-                    (*other, *glimpse)
-                };
-                pairs.insert((a.min(b), a.max(b)), pair);
+        .fold(Vector2::zeros(), |most, r| r.sup(&most));
+    let mut pairs = Vec::new();
+    for (index, glimpse) in open.iter().enumerate().filter(|(_, g)| asks(g)) {
+        let own = reaches[index];
+        let reach = (own + widest).map(|reach| reach.min(NEAR_PX));
+        let near = grid.near(places[index], (reach.x, reach.y));
+        let near = near.filter(|other| {
+            let (off, both) = (open[*other].seen - glimpse.seen, own + reaches[*other]);
+            off.x.abs() <= both.x.min(NEAR_PX) && off.y.abs() <= both.y.min(NEAR_PX)
+        });
+        // Two that both ask meet once.
+        let near = near.filter(|other| *other > index || !asks(open[*other]));
+        for other in near
+            .filter(|other| *other != index)
+            .map(|other| open[other])
+        {
+            let (elder, younger) = if glimpse.slot < other.slot {
+                (*glimpse, other)
+            } else {
+                (other, *glimpse)
+            };
+            let one_seen = seen[elder.slot] || seen[younger.slot];
+            if one_seen && fires[elder.slot].class == fires[younger.slot].class {
+                pairs.push((elder, younger));
             }
         }
     }
-    pairs.into_values().collect()
+    pairs
 }
 
 /// Squared Mahalanobis distance between where two fires should be seen: what both were seen through

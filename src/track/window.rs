@@ -42,7 +42,7 @@ pub struct Kept {
 /// The latest looks at a fire, and what was known before them.
 #[derive(Debug, Clone)]
 pub struct Window {
-    before: Joint,
+    before: Box<Joint>,
     before_at: ServiceTime,
     looks: Vec<Kept>,
     /// Whether `before` holds what the ground says.
@@ -67,7 +67,7 @@ impl Window {
     #[must_use]
     pub fn new(before: Joint, before_at: ServiceTime) -> Self {
         Self {
-            before,
+            before: Box::new(before),
             before_at,
             looks: Vec::new(),
             ground_is_folded: false,
@@ -110,7 +110,7 @@ impl Window {
             self.ground_is_folded = true;
         }
         let folded: Vec<Kept> = self.looks.drain(..FOLDED.min(self.looks.len())).collect();
-        let (joint, at) = (&mut self.before, &mut self.before_at);
+        let (joint, at) = (self.before.as_mut(), &mut self.before_at);
         run(&folded, joint, at, chart, about, pace);
     }
 
@@ -148,7 +148,7 @@ impl Window {
         pace: &Pace,
         ground: Option<&LocalGround>,
     ) -> (Joint, ServiceTime) {
-        let (mut joint, mut at) = (self.before.clone(), self.before_at);
+        let (mut joint, mut at) = (self.before.as_ref().clone(), self.before_at);
         if let Some(ground) = ground.filter(|_| !self.ground_is_folded) {
             ground.hold(&mut joint, chart, about.at);
         }

@@ -6,59 +6,109 @@ use super::law::{Draw, Law};
 use super::truth::{Autopilot, ErrorModel, Flame, Gnss, IMAGE_PX, Lens, Seen, Slow, TrueCamera};
 use emberfix_sim::noise::stream;
 use nalgebra::{Matrix3, Vector3};
+use rand_chacha::ChaCha8Rng;
 use rustix::time::{ClockId, clock_gettime};
 
 /// Looks before the clock runs, and looks that are timed.
 const WARM: usize = 3;
 const TIMED: usize = 7;
 
-/// Milliseconds of one core per frame, the middle of seven, with `count` fires in the picture that are all seen in
-/// each look, on one thread; and how many fires the estimator then keeps.
+/// A crowd of fires under a camera that hovers: all are seen in each look.
+pub struct Crowd {
+    lens: Lens,
+    errors: ErrorModel,
+    course: Course,
+    flames: Vec<Flame>,
+    boxes: Draw,
+    jitter: ChaCha8Rng,
+    pilot: Pilot,
+    looks: u32,
+}
+
+/// One look of a crowd, drawn and not yet taken in.
+pub struct CrowdLook {
+    seen: Vec<Seen>,
+    t_s: f64,
+}
+
+/// Seconds between two looks.
+const LOOK_S: f64 = 0.4;
+
+impl Crowd {
+    /// So many fires; nothing is seen yet.
+    ///
+    /// # Errors
+    /// [`SetupError`] when the rig is refused.
+    pub fn new(count: usize, seed: u64) -> Result<Self, SetupError> {
+        let errors = ErrorModel::of(Gnss::Rtk, 0.5);
+        let lens = Lens {
+            depression_deg: 60.0,
+            ..Lens::wide()
+        };
+        let course = Course {
+            kind: Kind::Hover,
+            ground_range_m: 60.0,
+            height_m: 100.0,
+            speed_m_s: 0.0,
+            azimuth_rad: 0.0,
+            duration_s: 10.0,
+            gusts: Gusts::calm(),
+        };
+        Ok(Self {
+            flames: spread(&course, &lens, count),
+            boxes: Draw::new(stream(seed, "boxes"), Law::Assumed),
+            jitter: stream(seed, "speed"),
+            pilot: Pilot::new(&lens, &errors, None)?,
+            lens,
+            errors,
+            course,
+            looks: 0,
+        })
+    }
+
+    /// What the next look shows.
+    pub fn draw(&mut self) -> CrowdLook {
+        let t_s = LOOK_S * f64::from(self.looks);
+        self.looks += 1;
+        let camera = TrueCamera {
+            lens: &self.lens,
+            state: &self.course.state(t_s),
+            slow: &Slow::zeros(),
+        };
+        let flames = self.flames.iter();
+        let seen = flames
+            .filter_map(|flame| camera.see(flame, &self.errors, &mut self.boxes))
+            .collect();
+        CrowdLook { seen, t_s }
+    }
+
+    /// Takes a look in: what a frame costs.
+    pub fn take(&mut self, look: &CrowdLook) {
+        let (slow, rng) = (Slow::zeros(), &mut self.jitter);
+        let autopilot = Autopilot::new(&self.course, look.t_s, &slow, &self.errors, rng);
+        self.pilot.look(&autopilot, &look.seen);
+    }
+}
+
+/// Milliseconds of one core per frame, the middle of seven, with `count` fires in the picture that
+/// are all seen in each look, on one thread; and how many fires the estimator then keeps.
 ///
 /// # Errors
 /// [`SetupError`] when the rig is refused.
 pub fn step_ms(count: usize, seed: u64) -> Result<(f64, usize), SetupError> {
-    let errors = ErrorModel::of(Gnss::Rtk, 0.5);
-    let lens = Lens {
-        depression_deg: 60.0,
-        ..Lens::wide()
-    };
-    let course = Course {
-        kind: Kind::Hover,
-        ground_range_m: 60.0,
-        height_m: 100.0,
-        speed_m_s: 0.0,
-        azimuth_rad: 0.0,
-        duration_s: 10.0,
-        gusts: Gusts::calm(),
-    };
-    let flames = spread(&course, &lens, count);
-    let mut rng = stream(seed, "speed");
-    let mut draw = Draw::new(stream(seed, "boxes"), Law::Assumed);
-    let mut pilot = Pilot::new(&lens, &errors, None)?;
+    let mut crowd = Crowd::new(count, seed)?;
     let mut times_ms = Vec::new();
     for look in 0..WARM + TIMED {
-        let t_s = 0.4 * look as f64;
-        let state = course.state(t_s);
-        let camera = TrueCamera {
-            lens: &lens,
-            state: &state,
-            slow: &Slow::zeros(),
-        };
-        let seen: Vec<Seen> = flames
-            .iter()
-            .filter_map(|flame| camera.see(flame, &errors, &mut draw))
-            .collect();
-        let autopilot = Autopilot::new(&course, t_s, &Slow::zeros(), &errors, &mut rng);
+        let seen = crowd.draw();
         let start_ms = thread_ms();
-        pilot.look(&autopilot, &seen);
+        crowd.take(&seen);
         if look >= WARM {
             times_ms.push(thread_ms() - start_ms);
         }
     }
     Ok((
         super::score::percentile(&mut times_ms, 0.5),
-        pilot.fires().len(),
+        crowd.pilot.fires().len(),
     ))
 }
 

@@ -272,16 +272,29 @@ fn incident_figures(campaign: &Campaign) -> Vec<Figure> {
     ]
 }
 
-/// The first count against its own bound, each further one against ten times the first.
+/// What a fire may cost in a frame: 10 ms for a thousand.
+const MS_PER_FIRE: f64 = 0.01;
+
 fn time_figures(campaign: &Campaign) -> Vec<Figure> {
-    let mut figures = Vec::new();
-    let mut limit = 10.0;
-    for (fires, ms, kept) in &campaign.times {
+    let one = |(fires, ms, kept): &(usize, f64, usize)| {
         let name = format!("location.step_{fires}_fires_ms");
         // A frame that forgot fires was not timed with them.
         let value = (kept >= fires).then_some(*ms);
-        figures.push(most(&name, value, "ms", limit, 1));
-        limit = 10.0 * ms;
+        most(&name, value, "ms", MS_PER_FIRE * *fires as f64, 1)
+    };
+    let mut figures: Vec<_> = campaign.times.iter().map(one).collect();
+    // Of the largest count over the smallest, each per fire: 1 when the cost is linear.
+    if let ([(few, first, _), ..], [.., (many, last, _)]) =
+        (&campaign.times[..], &campaign.times[..])
+        && few < many
+    {
+        let growth = (last / *many as f64) / (first / *few as f64);
+        figures.push(Figure::told(
+            "location.step_cost_growth",
+            Some(growth),
+            "",
+            1,
+        ));
     }
     figures
 }
