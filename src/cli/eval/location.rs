@@ -73,7 +73,7 @@ fn options(arguments: &LocationArguments) -> Options {
         flights: when(Part::Flights, flights),
         foreign_flights: when(Part::Laws, flights / 10),
         p3_flights: when(Part::P3, 4000 / scale),
-        mount_flights: when(Part::Mount, 200 / scale),
+        mount_flights: when(Part::Mount, 600 / scale),
         incident_flights: when(Part::Incidents, 400 / scale),
         timed_fires: timed[..when(Part::Times, timed.len())].to_vec(),
         seed: arguments.seed,

@@ -1,10 +1,12 @@
 //! What errors are drawn from: what the estimator assumes, and what it does not.
 
+use super::flight::log_uniform;
 use super::truth::{Slow, gauss, slow};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StudentT};
 use serde::Serialize;
+use std::f64::consts::TAU;
 
 /// The distributions that the errors of a flight come from. All keep the sigmas that the service is
 /// told; what differs is their shape, or how they hang together in time.
@@ -29,13 +31,18 @@ pub enum Law {
     /// GNSS errors that walk away from a normal start by 0.1 of their moving sigma per root second,
     /// unbounded: doubled variance after 100 s.
     WalkingGnss,
+    /// GNSS errors that stay and then jump to another value, as often as they would have forgotten
+    /// the old one: the assumed correlation in time, by jumps of metres within a look.
+    JumpingGnss,
+    /// All that wanders (GNSS, heading, tilt) is a sine of a period by chance, 20 to 120 s.
+    SineDrift,
     /// Tails, sticky boxes, Laplace mounts and fast GNSS together.
     Everything,
 }
 
 impl Law {
     /// Those that the estimator does not assume.
-    pub const FOREIGN: [Self; 8] = [
+    pub const FOREIGN: [Self; 10] = [
         Self::HeavyTails,
         Self::StickyBoxes,
         Self::UniformMount,
@@ -43,6 +50,8 @@ impl Law {
         Self::FastGnss,
         Self::SlowGnss,
         Self::WalkingGnss,
+        Self::JumpingGnss,
+        Self::SineDrift,
         Self::Everything,
     ];
 
@@ -58,6 +67,8 @@ impl Law {
             Self::FastGnss => "GNSS correlation time / 3",
             Self::SlowGnss => "GNSS correlation time x 3",
             Self::WalkingGnss => "GNSS random walk, 0.1 sigma per root second",
+            Self::JumpingGnss => "GNSS in jumps instead of a drift",
+            Self::SineDrift => "sine drift of GNSS, heading, tilt, 20 to 120 s",
             Self::Everything => "t pixels, sticky boxes, Laplace, fast GNSS together",
         }
     }
@@ -99,7 +110,39 @@ impl Law {
             return now + WALK * sigma * dt_s.sqrt() * fresh;
         }
         let keep = (-dt_s / correlation_s).exp();
+        if self == Self::JumpingGnss && !of_mount {
+            return if rng.random_bool(keep) {
+                now
+            } else {
+                sigma * fresh
+            };
+        }
         keep * now + sigma * (1.0 - keep * keep).sqrt() * fresh
+    }
+}
+
+/// Periods of [`Law::SineDrift`], seconds.
+const PERIODS_S: (f64, f64) = (20.0, 120.0);
+
+/// Errors that swing, each with a phase and a rate of its own.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Sines {
+    phases_rad: Slow,
+    rates_rad_s: Slow,
+}
+
+impl Sines {
+    pub(super) fn drawn(rng: &mut ChaCha8Rng) -> Self {
+        Self {
+            phases_rad: Slow::from_fn(|_, _| rng.random_range(0.0..TAU)),
+            rates_rad_s: Slow::from_fn(|_, _| TAU / log_uniform(rng, PERIODS_S.0, PERIODS_S.1)),
+        }
+    }
+
+    /// At a time, for these sigmas.
+    pub(super) fn at(&self, t_s: f64, sigmas: &Slow) -> Slow {
+        let phases = self.phases_rad + self.rates_rad_s * t_s;
+        phases.map(f64::sin).component_mul(sigmas) * 2.0_f64.sqrt()
     }
 }
 
@@ -177,7 +220,13 @@ mod tests {
     #[test]
     fn every_law_keeps_the_sigmas_at_the_start() {
         let errors = ErrorModel::of(Gnss::Consumer, 2.0);
-        for law in [Law::Assumed, Law::UniformMount, Law::LaplaceMount] {
+        for law in [
+            Law::Assumed,
+            Law::UniformMount,
+            Law::LaplaceMount,
+            Law::JumpingGnss,
+            Law::SineDrift,
+        ] {
             let mut squares = Slow::zeros();
             for seed in 0..4000 {
                 let slow = wander(&mut stream(seed, "law"), &errors, &[0.0], law)[0];
@@ -190,20 +239,21 @@ mod tests {
     }
 
     #[test]
-    fn a_gauss_markov_error_forgets_as_its_correlation_time_says() {
+    fn errors_that_drift_and_that_jump_forget_as_their_correlation_time_says() {
         let errors = ErrorModel::of(Gnss::Consumer, 2.0);
-        let product: f64 = (0..4000)
-            .map(|seed| {
-                let values = wander(
-                    &mut stream(seed, "law"),
-                    &errors,
-                    &[0.0, 30.0, 100.0],
-                    Law::Assumed,
-                );
-                values[0][0] * values[2][0] / (1.5 * 1.5)
-            })
-            .sum();
-        // 0.5 + 0.5 exp(-100 / 60); one sigma of the mean of 4000 products is 0.017.
-        assert!((product / 4000.0 - 0.5944).abs() < 0.06, "{product}");
+        for law in [Law::Assumed, Law::JumpingGnss] {
+            let product: f64 = (0..4000)
+                .map(|seed| {
+                    let mut rng = stream(seed, "law");
+                    let values = wander(&mut rng, &errors, &[0.0, 30.0, 100.0], law);
+                    values[0][0] * values[2][0] / (1.5 * 1.5)
+                })
+                .sum();
+            // 0.5 + 0.5 exp(-100 / 60); one sigma of the mean of 4000 products is 0.017.
+            assert!(
+                (product / 4000.0 - 0.5944).abs() < 0.06,
+                "{law:?} {product}"
+            );
+        }
     }
 }

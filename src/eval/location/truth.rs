@@ -6,7 +6,7 @@
 //! plane; the plane's datum and the way to the Earth are the simulator's.
 
 use super::flight::{Course, normal3};
-use super::law::{Draw, Law};
+use super::law::{Draw, Law, Sines};
 use emberfix_sim::noise::normal;
 use emberfix_sim::state::BodyState;
 use nalgebra::{Matrix3, Rotation3, SVector, Vector3};
@@ -474,9 +474,12 @@ pub fn wander(rng: &mut ChaCha8Rng, errors: &ErrorModel, times_s: &[f64], law: L
     let constant = Slow::from_fn(|i, _| law.constant(rng, i, sigmas[i] * shares[i].sqrt()));
     let moving = Slow::from_fn(|i, _| sigmas[i] * (1.0 - shares[i]).sqrt());
     let mut now = Slow::from_fn(|i, _| gauss(rng, moving[i]));
+    let sines = (law == Law::SineDrift).then(|| Sines::drawn(rng));
     let mut values = Vec::with_capacity(times_s.len());
     for (look, t_s) in times_s.iter().enumerate() {
-        if look > 0 {
+        if let Some(sines) = sines {
+            now = sines.at(*t_s, &moving);
+        } else if look > 0 {
             let dt_s = t_s - times_s[look - 1];
             now = Slow::from_fn(|i, _| law.next(rng, i, now[i], moving[i], dt_s, correlations[i]));
         }
