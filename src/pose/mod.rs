@@ -192,6 +192,9 @@ const ACCELERATION_M_S2: f64 = 2.0;
 /// A turn within one readout beyond this is named, and beyond that gives no pose, radians.
 const ROLLING_NAMED_RAD: f64 = 0.005;
 const ROLLING_REFUSED_RAD: f64 = 0.052;
+/// Error of the geoid model where the receiver does not say its own separation, metres: half a metre to
+/// a metre over most of the Earth (Lemoine et al., NASA/TP-1998-206861, 1998).
+const EGM96_SIGMA_M: f64 = 1.0;
 /// Vertical sigma of an altitude that the autopilot itself calls not valid, metres.
 const NOT_ESTIMATED_M: f64 = 10.0;
 /// An altitude older than this is not held against the receiver's.
@@ -229,6 +232,8 @@ pub struct PoseEstimator {
     attitudes: History<AttitudeSample>,
     positions: History<PositionSample>,
     gnss: Option<GnssQuality>,
+    /// What the receiver last said of its own accuracy, horizontal and vertical, metres.
+    stated_m: (Option<f64>, Option<f64>),
     heights: Heights,
     latest_altitude: Option<(ServiceTime, MslAltitude)>,
     gimbal: Option<Gimbal>,
@@ -244,6 +249,7 @@ impl PoseEstimator {
             attitudes: History::new(),
             positions: History::new(),
             gnss: None,
+            stated_m: (None, None),
             heights: Heights::default(),
             latest_altitude: None,
             gimbal: config.gimbal.map(Gimbal::new),
@@ -302,6 +308,10 @@ impl PoseEstimator {
         separation: Option<GeoidUndulation>,
     ) {
         let (horizontal_m, vertical_m) = sigmas_m;
+        self.stated_m = (
+            horizontal_m.or(self.stated_m.0),
+            vertical_m.or(self.stated_m.1),
+        );
         self.gnss = Some(GnssQuality {
             at: arrived,
             has_fix: has_3d_fix,
@@ -466,17 +476,19 @@ impl PoseEstimator {
     /// than the receiver says it is.
     fn judge_gnss(&self, pose: &mut Pose, gnss: GnssQuality) {
         let floor = self.config.gnss_floor_m;
-        if let Some(horizontal_m) = gnss.horizontal_m {
-            pose.gnss_horizontal_m = horizontal_m;
-        }
-        if let Some(vertical_m) = gnss.vertical_m {
-            pose.gnss_vertical_m = vertical_m;
-        }
+        // A receiver that falls silent is no better than it last said.
+        let unsaid = |usual_m: f64, last: Option<f64>| usual_m.max(last.unwrap_or(0.0));
+        pose.gnss_horizontal_m = gnss
+            .horizontal_m
+            .unwrap_or(unsaid(pose.gnss_horizontal_m, self.stated_m.0));
+        pose.gnss_vertical_m = gnss
+            .vertical_m
+            .unwrap_or(unsaid(pose.gnss_vertical_m, self.stated_m.1));
         if gnss.horizontal_m.is_none() || gnss.vertical_m.is_none() {
             pose.degraded.insert(Degraded::GnssAccuracyUnknown);
         }
         pose.gnss_horizontal_m = pose.gnss_horizontal_m.max(floor);
-        let stated = pose.gnss_vertical_m.max(floor);
+        let mut stated = pose.gnss_vertical_m.max(floor);
         let mut doubts = vec![self.heights.watch().disagreement_m()];
         if self.heights.watch().is_doubtful(stated) {
             pose.degraded.insert(Degraded::AltitudeDisagrees);
@@ -489,6 +501,7 @@ impl PoseEstimator {
             Separation::Receiver => {}
             Separation::Model => {
                 pose.degraded.insert(Degraded::GeoidApplied);
+                stated = stated.hypot(EGM96_SIGMA_M);
             }
             Separation::ModelAgainstReceiver { by_m } => {
                 pose.degraded.insert(Degraded::GeoidDisagrees);

@@ -1,6 +1,7 @@
 use super::*;
 use emberfix_frames::UnitQuaternion;
 use emberfix_mav::telemetry::GimbalYaw;
+use proptest::prelude::*;
 use std::f64::consts::FRAC_PI_2;
 
 const START_NS: i64 = 1_772_366_400_000_000_000;
@@ -559,4 +560,115 @@ fn a_separation_that_no_geoid_has_is_not_used_and_a_second_receiver_stands_in() 
     let pose = height(&second);
     assert!(pose.degraded.is_empty(), "{:?}", pose.degraded);
     assert!((pose.place.height().m() - 21.0 - model).abs() < 0.01);
+}
+
+/// What may go wrong with what is told.
+#[derive(Debug, Clone, Copy, Default)]
+struct Faults {
+    no_accuracy: bool,
+    no_separation: bool,
+    absurd_separation: bool,
+    altitude_jumps: bool,
+    altitude_invalid: bool,
+    no_timesync: bool,
+    attitude_slow: bool,
+    position_slow: bool,
+}
+
+impl Faults {
+    fn reasons(self) -> BTreeSet<Degraded> {
+        let named = [
+            (self.no_accuracy, Degraded::GnssAccuracyUnknown),
+            (
+                self.no_separation && !self.absurd_separation,
+                Degraded::GeoidApplied,
+            ),
+            (self.absurd_separation, Degraded::GeoidDisagrees),
+            (self.altitude_jumps, Degraded::AltitudeDisagrees),
+            (self.altitude_invalid, Degraded::AltitudeNotEstimated),
+            (self.no_timesync, Degraded::ClockNotSynced),
+            (self.attitude_slow, Degraded::AttitudeSlow),
+            (self.position_slow, Degraded::PositionSlow),
+        ];
+        let happened = named.into_iter().filter(|(happens, _)| *happens);
+        happened.map(|(_, reason)| reason).collect()
+    }
+
+    /// A pose at 2.05 s, of a receiver that says these sigmas until the faults begin.
+    fn pose(self, (horizontal_m, vertical_m): (f64, f64)) -> Pose {
+        let mut poses = if self.no_timesync {
+            PoseEstimator::new(PoseConfig::default())
+        } else {
+            synced()
+        };
+        let separation = match (self.absurd_separation, self.no_separation) {
+            (true, _) => Some(GeoidUndulation::from_m(-60.0)),
+            (false, true) => None,
+            (false, false) => Some(GeoidUndulation::from_m(10.0)),
+        };
+        let stated = (Some(horizontal_m), Some(vertical_m));
+        poses.add_gnss(service(1790), true, stated, separation);
+        let latest = if self.no_accuracy {
+            (None, None)
+        } else {
+            stated
+        };
+        poses.add_gnss(service(1990), true, latest, separation);
+        let later = |slow: bool| if slow { 2300 } else { 2100 };
+        position(&mut poses, 2000, 0.0, 10.0);
+        for receiver_m in [20.0, if self.altitude_jumps { 60.0 } else { 20.0 }] {
+            poses.add_gnss_altitude(service(2010), MslAltitude::from_m(receiver_m));
+        }
+        let position_ms = later(self.position_slow);
+        position(
+            &mut poses,
+            position_ms,
+            1e-2 * f64::from(position_ms - 2000),
+            10.0,
+        );
+        attitude(&mut poses, 2000, 0.0);
+        attitude(&mut poses, later(self.attitude_slow), 0.2);
+        poses.add_vertical_validity(!self.altitude_invalid);
+        fresh(poses.at(service(2050), service(2310)))
+    }
+}
+
+fn sigmas(pose: &Pose) -> [f64; 5] {
+    [
+        pose.gnss_horizontal_m,
+        pose.gnss_vertical_m,
+        pose.attitude_noise_rad,
+        pose.position_noise_m,
+        pose.time_sigma_s,
+    ]
+}
+
+proptest! {
+    /// Bad or missing input widens and is named; nothing that goes wrong makes anything surer.
+    #[test]
+    fn whatever_goes_wrong_is_named_and_never_narrows(
+        happens in prop::array::uniform8(any::<bool>()),
+        horizontal_m in 0.02..20.0_f64,
+        vertical_m in 0.02..30.0_f64,
+    ) {
+        let [no_accuracy, no_separation, absurd_separation, altitude_jumps, ..] = happens;
+        let [.., altitude_invalid, no_timesync, attitude_slow, position_slow] = happens;
+        let faults = Faults {
+            no_accuracy,
+            no_separation,
+            absurd_separation,
+            altitude_jumps,
+            altitude_invalid,
+            no_timesync,
+            attitude_slow,
+            position_slow,
+        };
+        let stated = (horizontal_m, vertical_m);
+        let (healthy, faulty) = (Faults::default().pose(stated), faults.pose(stated));
+        prop_assert_eq!(&healthy.degraded, &BTreeSet::new());
+        prop_assert_eq!(&faulty.degraded, &faults.reasons());
+        for (well, ill) in sigmas(&healthy).into_iter().zip(sigmas(&faulty)) {
+            prop_assert!(ill >= well, "{} of {}: {:?}", ill, well, faults);
+        }
+    }
 }
