@@ -3,7 +3,7 @@
 //! Raw TOML to a checked [`Mission`], every problem at once. Relative paths are relative to the
 //! mission file. The `[sim]` table belongs to the simulator and is not read here.
 
-use crate::detect::{DetectorConfig, Family};
+use crate::detect::{ClassPolicy, DetectorConfig, Family, ModelForm, Provider, YoloxOutput};
 use crate::locate::{SharedPriors, Terrain};
 use crate::pose::PoseConfig;
 use crate::range::{HsvMask, Method, RangeConfig};
@@ -11,6 +11,7 @@ use crate::track::TrackConfig;
 use emberfix_calib::{Checks, KeyProblem, Rig, RigError, toml_problem, unknown_keys};
 use emberfix_frames::{EllipsoidHeight, Wgs84, place_from_degrees};
 use serde::Deserialize;
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -150,11 +151,18 @@ struct RawModel {
     path: PathBuf,
     sha256: Option<String>,
     family: Option<Family>,
+    names: Option<Vec<String>>,
+    #[serde(default)]
+    classes: BTreeMap<String, ClassPolicy>,
+    yolox_output: Option<YoloxOutput>,
+    anchors: Option<Vec<[[f32; 2]; 3]>>,
+    providers: Option<Vec<Provider>>,
     threshold: Option<f64>,
     #[serde(default)]
     whole_frame_only: bool,
     tile_px: Option<u32>,
     overlap_px: Option<u32>,
+    frame_budget_ms: Option<f64>,
     threads: Option<u32>,
 }
 
@@ -241,10 +249,16 @@ const KNOWN: &[&str] = &[
     "model.path",
     "model.sha256",
     "model.family",
+    "model.names",
+    "model.classes.*",
+    "model.yolox_output",
+    "model.anchors",
+    "model.providers",
     "model.threshold",
     "model.whole_frame_only",
     "model.tile_px",
     "model.overlap_px",
+    "model.frame_budget_ms",
     "model.threads",
     "range.mask",
     "range.max_disparity_px",
@@ -557,9 +571,18 @@ fn build(raw: RawMission, path: &Path) -> Result<Mission, MissionError> {
 
 fn detector(raw: &RawModel, beside: &dyn Fn(&Path) -> PathBuf) -> DetectorConfig {
     let usual = DetectorConfig::new(beside(&raw.path));
+    let mut classes = usual.classes.clone();
+    classes.extend(raw.classes.clone());
     DetectorConfig {
         sha256: raw.sha256.clone(),
         family: raw.family,
+        names: raw.names.clone(),
+        classes,
+        form: ModelForm {
+            yolox_output: raw.yolox_output,
+            anchors: raw.anchors.clone(),
+        },
+        providers: raw.providers.clone().unwrap_or(usual.providers.clone()),
         threshold: raw.threshold,
         tile_px: if raw.whole_frame_only {
             None
@@ -567,6 +590,7 @@ fn detector(raw: &RawModel, beside: &dyn Fn(&Path) -> PathBuf) -> DetectorConfig
             raw.tile_px.or(usual.tile_px)
         },
         overlap_px: raw.overlap_px.unwrap_or(usual.overlap_px),
+        frame_budget_ms: raw.frame_budget_ms,
         threads: raw
             .threads
             .map_or(usual.threads, |threads| threads as usize),

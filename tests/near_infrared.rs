@@ -116,6 +116,7 @@ fn fly(near_infrared: bool) -> Flown {
                 width: label.right_px - label.left_px,
                 height: label.bottom_px - label.top_px,
             },
+            mask: None,
         };
         flames.map(detection).collect()
     });

@@ -258,6 +258,7 @@ fn fire_in(detector: &mut dyn Detector, rig: &Rig, picture: &Picture) -> Option<
         at: picture.at,
         sequence: picture.number,
         bgr: ImageDecoder::new(rig).left(&picture.left).ok()?,
+        ground: None,
     };
     let found = detector.detect(&image).ok()?;
     let best = found.iter().find(|d| d.class == DetectionClass::Fire)?;

@@ -78,7 +78,7 @@ impl Detector for BoxFileDetector {
         Ok(self
             .boxes(image.sequence)
             .iter()
-            .map(|given| given.detection)
+            .map(|given| given.detection.clone())
             .collect())
     }
 }
@@ -124,6 +124,7 @@ fn parse(text: &str) -> Result<BTreeMap<u64, Vec<GivenBox>>, (usize, String)> {
             class: raw.class,
             score: raw.score,
             box_px,
+            mask: None,
         };
         boxes.entry(raw.sequence).or_default().push(GivenBox {
             detection,

@@ -1,6 +1,6 @@
 //! What a mission says of its detector.
 
-use super::{DetectionClass, Family};
+use super::{DetectionClass, Family, Provider};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -32,6 +32,28 @@ impl ClassPolicy {
     }
 }
 
+/// What a YOLOX export leaves to its reader.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum YoloxOutput {
+    /// Boxes in cells, scores without their sigmoid.
+    Raw,
+    /// Boxes in cells, scores in 0..1.
+    RawBoxes,
+    /// Boxes in input pixels, scores in 0..1.
+    Decoded,
+}
+
+/// What the shapes of a model's outputs do not tell. Each from the model's metadata when absent.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct ModelForm {
+    /// What a YOLOX export leaves to do; by the values of its first answer when nobody says.
+    pub yolox_output: Option<YoloxOutput>,
+    /// Anchors of a Darknet model, width and height in input pixels: three a stride, finest stride
+    /// first; the published ones when nobody says.
+    pub anchors: Option<Vec<[[f32; 2]; 3]>>,
+}
+
 /// How to detect. [`DetectorConfig::problems`] checks the numbers, loading checks the model.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DetectorConfig {
@@ -43,6 +65,8 @@ pub struct DetectorConfig {
     pub family: Option<Family>,
     /// Names of the model's classes in order; from its metadata when absent.
     pub names: Option<Vec<String>>,
+    /// What its outputs' shapes do not tell.
+    pub form: ModelForm,
     /// Least score that counts, 0..1, for every class; from the metadata when absent.
     pub threshold: Option<f64>,
     /// Overlap over union above which two boxes are one, 0..1.
@@ -51,8 +75,13 @@ pub struct DetectorConfig {
     pub tile_px: Option<u32>,
     /// Least overlap of neighbouring tiles, pixels: a flame up to this size is whole in one tile.
     pub overlap_px: u32,
+    /// Time for one image, milliseconds: so many views are looked at as fit into it at the speed that is
+    /// measured at load; all of them when absent.
+    pub frame_budget_ms: Option<f64>,
     /// Threads of one inference.
     pub threads: usize,
+    /// What may compute it: the first that takes all of the model does.
+    pub providers: Vec<Provider>,
     /// Meaning of the model's class names; [`default_classes`](Self::default_classes) covers the
     /// usual ones.
     pub classes: BTreeMap<String, ClassPolicy>,
@@ -67,11 +96,14 @@ impl DetectorConfig {
             sha256: None,
             family: None,
             names: None,
+            form: ModelForm::default(),
             threshold: None,
             nms_iou: 0.5,
             tile_px: Some(416),
             overlap_px: 96,
+            frame_budget_ms: None,
             threads: 2,
+            providers: vec![Provider::Cpu],
             classes: Self::default_classes(),
         }
     }
@@ -105,6 +137,13 @@ impl DetectorConfig {
         };
         within("threshold", self.threshold.unwrap_or(0.5), 0.01, 1.0);
         within("nms_iou", self.nms_iou, 0.05, 0.95);
+        within("providers' number", self.providers.len() as f64, 1.0, 4.0);
+        within(
+            "frame_budget_ms",
+            self.frame_budget_ms.unwrap_or(100.0),
+            1.0,
+            1e4,
+        );
         within("threads", self.threads as f64, 1.0, 64.0);
         if let Some(tile_px) = self.tile_px {
             within("tile_px", f64::from(tile_px), 64.0, 8192.0);
@@ -114,6 +153,13 @@ impl DetectorConfig {
                 0.0,
                 f64::from(tile_px) / 2.0,
             );
+        }
+        let anchors = self.form.anchors.iter().flatten().flatten().flatten();
+        if let Some(bad) = anchors
+            .into_iter()
+            .find(|side| !(1.0..=4096.0).contains(*side))
+        {
+            problems.push(format!("anchors hold {bad}, allowed is 1 to 4096"));
         }
         if let Some(hash) = self.sha256.as_deref().filter(|hash| !is_sha256(hash)) {
             problems.push(format!(
@@ -141,16 +187,27 @@ mod tests {
             overlap_px: 80,
             threads: 0,
             sha256: Some("12".to_owned()),
+            form: ModelForm {
+                anchors: Some(vec![[[10.0, f32::NAN]; 3]]),
+                ..ModelForm::default()
+            },
             ..DetectorConfig::new("model.onnx")
         };
         let problems = config.problems();
-        for key in ["threshold", "nms_iou", "overlap_px", "threads", "sha256"] {
+        for key in [
+            "threshold",
+            "nms_iou",
+            "overlap_px",
+            "threads",
+            "sha256",
+            "anchors",
+        ] {
             assert!(
                 problems.iter().any(|line| line.starts_with(key)),
                 "{key}: {problems:?}"
             );
         }
-        assert_eq!(problems.len(), 5, "{problems:?}");
+        assert_eq!(problems.len(), 6, "{problems:?}");
         assert!(DetectorConfig::new("model.onnx").problems().is_empty());
     }
 }

@@ -114,15 +114,30 @@ pub enum ModelError {
         /// What belongs there.
         expected: String,
     },
-    /// A tensor is not the family's.
-    #[error("model {path}: {what} is {found}, a {family} model has {expected}", path = path.display())]
+    /// Its input can't be fed.
+    #[error(
+        "model {path}: its input is {found}, needed is one input [1, 3, rows, columns] of 32-bit floats, \
+         rows and columns fixed", path = path.display()
+    )]
+    Input {
+        /// The file.
+        path: PathBuf,
+        /// What the file has.
+        found: String,
+    },
+    /// No execution provider may run it.
+    #[error("model {path}: the mission names no execution provider", path = path.display())]
+    NoProvider {
+        /// The file.
+        path: PathBuf,
+    },
+    /// Its outputs are not the family's.
+    #[error("model {path}: its output is {found}, a {family} model has {expected}", path = path.display())]
     Tensor {
         /// The file.
         path: PathBuf,
         /// Family that was claimed.
         family: &'static str,
-        /// Which tensor and what of it.
-        what: String,
         /// What the family has.
         expected: String,
         /// What the file has.
@@ -140,6 +155,18 @@ pub enum ModelError {
         named: usize,
         /// Score columns.
         scored: i64,
+    },
+    /// Neither its tensors' shapes nor their values tell how to read them.
+    #[error(
+        "model {path}: its tensors do not show {what}; say so in the mission \
+         (model.yolox_output = \"raw\", \"raw_boxes\" or \"decoded\")",
+        path = path.display()
+    )]
+    Undecided {
+        /// The file.
+        path: PathBuf,
+        /// What they do not show.
+        what: &'static str,
     },
     /// ONNX Runtime can't run it: an operator or an opset that it lacks.
     #[error(

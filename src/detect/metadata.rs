@@ -1,7 +1,7 @@
 //! What a model's metadata say: family, classes, thresholds, normalisation.
 
 use super::family::{Colour, Family, Normalisation};
-use super::{DetectorConfig, ModelError};
+use super::{DetectorConfig, ModelError, ModelForm};
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -20,12 +20,10 @@ impl Metadata<'_> {
         if let Some(family) = configured {
             return Ok(family);
         }
-        if self
-            .entries
-            .get("task")
-            .is_some_and(|task| task == "detect")
-        {
-            return Ok(Family::Yolov8);
+        match self.entries.get("task").map(String::as_str) {
+            Some("detect") => return Ok(Family::Yolov8),
+            Some("segment") => return Ok(Family::Yolov8Seg),
+            _ => {}
         }
         let path = || self.path.to_owned();
         let Some(found) = self.entries.get("family") else {
@@ -101,6 +99,29 @@ impl Metadata<'_> {
             Some(other) => return Err(self.malformed("color", other, "bgr or rgb")),
         };
         Ok(Normalisation { colour, mean, std })
+    }
+
+    /// What the shapes of its outputs do not tell: the mission's word, else the model's.
+    pub fn form(&self, configured: &ModelForm) -> Result<ModelForm, ModelError> {
+        let yolox_output = match (configured.yolox_output, self.entries.get("yolox_output")) {
+            (None, Some(text)) => {
+                let read = serde_json::from_value(text.as_str().into());
+                let expected = "raw, raw_boxes or decoded";
+                Some(read.map_err(|_| self.malformed("yolox_output", text, expected))?)
+            }
+            (told, _) => told,
+        };
+        let anchors = match &configured.anchors {
+            None => self.json(
+                "anchors",
+                "three pairs [width, height] a stride, finest first",
+            )?,
+            told => told.clone(),
+        };
+        Ok(ModelForm {
+            yolox_output,
+            anchors,
+        })
     }
 
     fn number(&self, key: &str) -> Result<Option<f64>, ModelError> {

@@ -5,8 +5,9 @@
 //! one. **Out:** [`Detection`]s in pixels of that image, best first, one list per image.
 //!
 //! - [`OnnxDetector`] runs an ONNX model over the whole frame and over tiles at native resolution,
-//!   and merges what they see: `preprocess` cuts the views, one file per model family turns tensors
-//!   into boxes (`nanodet`, `yolov8`), `nms` makes one box of one flame.
+//!   and merges what they see: `preprocess` cuts the views, one file of `family` per model family turns
+//!   tensors into boxes and masks, `nms` makes one box of one flame.
+//!   Where a frame's time is bounded, `attention` says which tiles are worth it.
 //! - [`BoxFileDetector`] reads given boxes from a file.
 //!
 //! **Assumptions.** A model file is trusted as far as its hash, its size and its tensors were
@@ -17,30 +18,35 @@
 //! about 10 px at the network's input is not seen: without tiles a 1 m fire goes unseen beyond 26 m
 //! at 1280 px, with native tiles beyond 80 m.
 
+mod attention;
 mod boxfile;
 mod config;
 mod error;
 mod family;
 #[cfg(test)]
 mod lookalike;
+mod mask;
 mod metadata;
 mod model_file;
-mod nanodet;
+mod network;
 mod nms;
 mod onnx;
 mod preprocess;
 mod runtime;
-mod yolov8;
 
+pub use attention::GroundScale;
 pub use boxfile::{BoxFileDetector, BoxFileError, GivenBox};
-pub use config::{ClassPolicy, DetectorConfig};
+pub use config::{ClassPolicy, DetectorConfig, ModelForm, YoloxOutput};
 pub use error::ModelError;
 pub use family::Family;
-pub use onnx::{ClassInfo, DetectorInfo, OnnxDetector};
+pub use mask::Mask;
+pub use network::{PassedOver, Provider};
+pub use onnx::{ClassInfo, DetectorInfo, OnnxDetector, Spent};
 
 use emberfix_frames::ServiceTime;
 use opencv::core::Mat;
 use serde::{Deserialize, Serialize};
+use std::sync::Arc;
 
 /// What a detector's class means to us.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -63,6 +69,8 @@ pub struct LeftImage {
     pub sequence: u64,
     /// Pixels: rows x columns x 3, 8 bit, BGR.
     pub bgr: Mat,
+    /// How large things on the ground appear in it, where that is known.
+    pub ground: Option<GroundScale>,
 }
 
 /// A box in pixels of the raw left image; pixel centres at whole numbers.
@@ -105,7 +113,7 @@ impl BoxPx {
 }
 
 /// One thing found in one image.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Detection {
     /// What it is.
     pub class: DetectionClass,
@@ -113,6 +121,8 @@ pub struct Detection {
     pub score: f64,
     /// Where, in the raw left image.
     pub box_px: BoxPx,
+    /// Which pixels, where the model tells.
+    pub mask: Option<Arc<Mask>>,
 }
 
 /// Finds fire and smoke in one image. A miss is an empty list, not an error.
@@ -130,7 +140,11 @@ pub trait Detector: Send {
 /// [`ModelError`] that names the file, what was expected and what was found.
 pub fn open(config: &DetectorConfig) -> Result<Box<dyn Detector>, ModelError> {
     let detector = OnnxDetector::load(config)?;
-    tracing::info!(info = ?detector.info(), "model loaded");
+    let info = detector.info();
+    for (provider, why) in &info.passed_over {
+        tracing::warn!(provider = provider.name(), %why, "execution provider does not run the model");
+    }
+    tracing::info!(?info, "model loaded");
     Ok(Box::new(detector))
 }
 

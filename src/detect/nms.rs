@@ -1,8 +1,11 @@
 //! One box per flame: suppression per class, pieces joined across tile borders, lookalikes.
 
+use super::mask::Mask;
 use super::{BoxPx, Detection, DetectionClass};
+use std::sync::Arc;
 
-/// Boxes that enter suppression, at most; the best ones. Bounds its time at any output.
+/// Boxes that enter suppression, of one view and of all, at most; the best ones. Bounds its time at any
+/// output.
 const MAX_CANDIDATES: usize = 512;
 
 /// Share of the smaller box inside the other from which boxes of two views are one flame.
@@ -12,11 +15,14 @@ const CONTAINED: f64 = 0.6;
 const JOINED: f64 = 0.15;
 
 /// One box as one view saw it.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub(super) struct Candidate {
     pub class: DetectionClass,
     pub score: f64,
     pub box_px: BoxPx,
+    pub mask: Option<Arc<Mask>>,
+    /// Its number among the boxes that the view's answer held.
+    pub number: usize,
     /// Which view.
     pub view: usize,
     /// Input pixels per raw pixel in it.
@@ -25,27 +31,31 @@ pub(super) struct Candidate {
     pub cut: bool,
 }
 
-/// Detections, best first.
+/// What one view saw, each thing once, best first: plain class-wise suppression.
+pub(super) fn within_view(mut candidates: Vec<Candidate>, iou: f64) -> Vec<Candidate> {
+    best_first(&mut candidates);
+    keep_first(candidates, |kept, next| kept.box_px.iou(&next.box_px) > iou)
+}
+
+/// What all views saw, best first, from what each view saw.
 pub(super) fn merge(mut candidates: Vec<Candidate>, iou: f64) -> Vec<Detection> {
-    candidates.sort_by(|a, b| b.score.total_cmp(&a.score));
-    candidates.truncate(MAX_CANDIDATES);
-    let kept = suppress(join_pieces(within_views(candidates, iou)), iou);
+    best_first(&mut candidates);
+    let kept = suppress(join_pieces(candidates), iou);
     let mut detections: Vec<Detection> = without_lookalikes(&kept, iou)
         .map(|kept| Detection {
             class: kept.class,
             score: kept.score,
             box_px: kept.box_px,
+            mask: kept.mask.clone(),
         })
         .collect();
     detections.sort_by(|a, b| b.score.total_cmp(&a.score));
     detections
 }
 
-/// Plain class-wise suppression inside each view; wants the best first.
-fn within_views(candidates: Vec<Candidate>, iou: f64) -> Vec<Candidate> {
-    keep_first(candidates, |kept, next| {
-        kept.view == next.view && kept.box_px.iou(&next.box_px) > iou
-    })
+fn best_first(candidates: &mut Vec<Candidate>) {
+    candidates.sort_by(|a, b| b.score.total_cmp(&a.score));
+    candidates.truncate(MAX_CANDIDATES);
 }
 
 /// Joins pieces of one flame that tile borders cut, where no view shows it whole.
@@ -118,14 +128,17 @@ fn united(a: &Candidate, b: &Candidate) -> Candidate {
     let (x, y) = (a.box_px.x.min(b.box_px.x), a.box_px.y.min(b.box_px.y));
     let right = (a.box_px.x + a.box_px.width).max(b.box_px.x + b.box_px.width);
     let bottom = (a.box_px.y + a.box_px.height).max(b.box_px.y + b.box_px.height);
+    let box_px = BoxPx {
+        x,
+        y,
+        width: right - x,
+        height: bottom - y,
+    };
+    let masks = a.mask.as_ref().zip(b.mask.as_ref());
     Candidate {
-        box_px: BoxPx {
-            x,
-            y,
-            width: right - x,
-            height: bottom - y,
-        },
-        ..*best
+        box_px,
+        mask: masks.map(|(a, b)| Arc::new(a.united(b, &box_px))),
+        ..best.clone()
     }
 }
 
@@ -152,10 +165,39 @@ mod tests {
                 width,
                 height,
             },
+            mask: None,
+            number: 0,
             view: 1,
             scale: 1.0,
             cut: false,
         }
+    }
+
+    /// What one view or more saw, as a detector puts it together.
+    fn merge(candidates: Vec<Candidate>, iou: f64) -> Vec<Detection> {
+        let views = candidates.iter().map(|candidate| candidate.view).max();
+        let of = |view| {
+            let seen = candidates.iter().filter(move |seen| seen.view == view);
+            within_view(seen.cloned().collect(), iou)
+        };
+        super::merge((0..=views.unwrap_or(0)).flat_map(of).collect(), iou)
+    }
+
+    #[test]
+    fn the_mask_of_a_joined_flame_is_that_of_its_pieces() {
+        let piece = |view, x: f64| {
+            let mut piece = fire(x, 0.0, 10.0, 10.0, 0.6);
+            piece.mask = Some(Arc::new(Mask::within(&piece.box_px, |_, row| row < 5.0)));
+            Candidate {
+                view,
+                cut: true,
+                ..piece
+            }
+        };
+        let found = merge(vec![piece(1, 0.0), piece(2, 6.0)], 0.5);
+        assert_eq!(found.len(), 1);
+        // Columns 0 to 16, rows 0 to 4.
+        assert_eq!(found[0].mask.as_ref().unwrap().area_px(), 17 * 5);
     }
 
     #[test]
@@ -238,7 +280,7 @@ mod tests {
             view: 2,
             ..fire(380.0, 100.0, 36.0, 80.0, 0.9)
         };
-        let found = merge(vec![whole, piece], 0.5);
+        let found = merge(vec![whole.clone(), piece], 0.5);
         assert_eq!(found.len(), 1);
         assert_eq!(found[0].box_px, whole.box_px);
     }

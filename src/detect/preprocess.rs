@@ -6,9 +6,12 @@
 
 use super::BoxPx;
 use super::family::{Colour, InputBox, InputSize, Normalisation};
-use opencv::core::{Mat, MatTraitConst, Rect, Size, Vec3b};
+use super::mask::{Mask, MaskLogits};
+use opencv::core::{
+    self, CV_32FC1, Mat, MatTrait, MatTraitConst, Rect, Size, ToInputArray, Vector,
+};
 use opencv::imgproc;
-use opencv::prelude::MatTraitConstManual;
+use std::ops::Range;
 
 /// Grey of the bars, as in training.
 const BAR: f32 = 114.0;
@@ -61,6 +64,18 @@ impl View {
         }
     }
 
+    /// The part of the raw image that it shows: columns, rows.
+    pub fn extent(&self) -> (Range<f64>, Range<f64>) {
+        let Source {
+            x,
+            y,
+            width,
+            height,
+        } = self.source;
+        let range = |from: u32, length: u32| f64::from(from)..f64::from(from + length);
+        (range(x, width), range(y, height))
+    }
+
     /// Input pixels per raw pixel.
     pub fn scale(&self) -> f64 {
         self.scale.0
@@ -87,6 +102,18 @@ impl View {
                 height,
             },
             cut,
+        })
+    }
+
+    /// A mask of the network in the raw image, within a box of it.
+    pub fn mask_to_raw(self, logits: &MaskLogits, box_px: &BoxPx) -> Mask {
+        let across = |column: f64| {
+            (column + 0.5 - f64::from(self.source.x)) * self.scale.0 + self.offset.0 as f64
+        };
+        let down =
+            |row: f64| (row + 0.5 - f64::from(self.source.y)) * self.scale.1 + self.offset.1 as f64;
+        Mask::within(box_px, |column, row| {
+            logits.covers(across(column), down(row))
         })
     }
 
@@ -172,6 +199,8 @@ pub(super) struct Painter {
     /// Channel of the BGR image that each channel of the input shows.
     channel: [usize; 3],
     scaled: Mat,
+    /// The channels of what is painted, one by one.
+    channels: Vector<Mat>,
     /// Batch 1, channels, rows, columns.
     pub tensor: Vec<f32>,
 }
@@ -188,6 +217,7 @@ impl Painter {
                 Colour::Rgb => [2, 1, 0],
             },
             scaled: Mat::default(),
+            channels: Vector::new(),
             tensor: vec![0.0; 3 * input.width * input.height],
         }
     }
@@ -217,22 +247,28 @@ impl Painter {
         filled
     }
 
-    fn fill(&mut self, fitted: &impl MatTraitConst, view: &View) -> opencv::Result<()> {
+    fn fill(
+        &mut self,
+        fitted: &(impl MatTraitConst + ToInputArray),
+        view: &View,
+    ) -> opencv::Result<()> {
         let (columns, rows) = view.fitted;
         if (columns, rows) != (self.input.width, self.input.height) {
             self.fill_bars();
         }
-        let plane = self.input.width * self.input.height;
-        for row in 0..rows {
-            let pixels = fitted.at_row::<Vec3b>(row as i32)?;
-            let start = (row + view.offset.1) * self.input.width + view.offset.0;
-            for c in 0..3 {
-                let (gain, shift, channel) = (self.gain[c], self.shift[c], self.channel[c]);
-                let target = &mut self.tensor[c * plane + start..][..columns];
-                for (value, pixel) in target.iter_mut().zip(pixels) {
-                    *value = f32::from(pixel.0[channel]) * gain + shift;
-                }
-            }
+        core::split(fitted, &mut self.channels)?;
+        let (width, height) = (self.input.width, self.input.height);
+        let at = Rect::new(
+            view.offset.0 as i32,
+            view.offset.1 as i32,
+            columns as i32,
+            rows as i32,
+        );
+        for (c, plane) in self.tensor.chunks_exact_mut(width * height).enumerate() {
+            let (gain, shift) = (f64::from(self.gain[c]), f64::from(self.shift[c]));
+            let channel = self.channels.get(self.channel[c])?;
+            let mut plane = Mat::new_rows_cols_with_data_mut(height as i32, width as i32, plane)?;
+            channel.convert_to(&mut plane.roi_mut(at)?, CV_32FC1, gain, shift)?;
         }
         Ok(())
     }
@@ -248,7 +284,7 @@ impl Painter {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use opencv::core::{CV_8UC3, MatTrait, Scalar};
+    use opencv::core::{CV_8UC3, Scalar, Vec3b};
 
     const INPUT: InputSize = InputSize {
         width: 416,
@@ -268,6 +304,31 @@ mod tests {
             top,
             right,
             bottom,
+            row: 0,
+        }
+    }
+
+    /// The same edge of the input, once as a box and once as a mask, is the same edge of the image.
+    #[test]
+    fn masks_come_back_to_where_boxes_do() {
+        for view in plan((1280, 720), INPUT, Some(416), 96) {
+            // Grid pixels of 4: logits change sign at column 200 of the input.
+            let values = |k: usize| if k % 104 < 50 { 1.0 } else { -1.0 };
+            let logits = MaskLogits {
+                columns: 104,
+                rows: 104,
+                stride: (4.0, 4.0),
+                values: (0..104 * 104).map(values).collect(),
+            };
+            let seen = view.to_raw(&of(180.0, 180.0, 220.0, 220.0)).unwrap().box_px;
+            let edge = view.to_raw(&of(180.0, 180.0, 200.0, 220.0)).unwrap().box_px;
+            let mask = view.mask_to_raw(&logits, &seen);
+            let last = mask.pixels().map(|(column, _)| column).max().unwrap();
+            let edge = edge.x + edge.width;
+            assert!(
+                (edge - 1.0..=edge).contains(&f64::from(last)),
+                "{last} {edge}"
+            );
         }
     }
 

@@ -24,14 +24,14 @@ pub use vision::{Seen, Vision};
 use crate::alarm::{Action, Alarm, AlarmDesk, Area, FireId, Situation};
 use crate::assess::extent::{Extent, Wind};
 use crate::assess::watch::{Assessment, Assessor, Light};
-use crate::detect::{Detection, Detector};
+use crate::detect::{Detection, Detector, GroundScale};
 use crate::ingest::StereoPair;
 use crate::locate::{Ground, SharedPriors, Terrain, TerrainHit, View, fix, meet_terrain};
 use crate::mission::Mission;
 use crate::pose::{Pose, PoseAnswer, PoseEstimator};
 use crate::range::Ranger;
 use crate::track::{Classified, Estimated, Fire, Outcome, Tracker};
-use emberfix_calib::{RectifiedPixel, Rig};
+use emberfix_calib::{Eye, RawPixel, RectifiedPixel, Rig};
 use emberfix_frames::{
     Coordinate, GeoidUndulation, Metres, MissionEnu, ServiceTime, SignedDuration, Stamped,
     TimeSyncSample, Vector3, Wgs84, Wgs84Parts, ecef_from_enu, place_from_ecef, seconds,
@@ -102,6 +102,8 @@ pub struct Pipeline {
     terrain: Option<Arc<dyn Terrain>>,
     shared: SharedPriors,
     vision: Vision,
+    /// Whether the detector's time is bounded, so that it must choose where to look.
+    bounded: bool,
     check: SelfCheck,
     poses: PoseEstimator,
     tracker: Tracker,
@@ -151,6 +153,7 @@ impl Pipeline {
             terrain: mission.terrain.clone(),
             shared: mission.shared,
             vision: Vision::new(&mission.rig, detector, ranger),
+            bounded: mission.detector.frame_budget_ms.is_some(),
             check: SelfCheck::new(mission.rig.sigmas().disparity_bias_px),
             poses: PoseEstimator::new(mission.pose),
             tracker: Tracker::new(mission.track, first_fire),
@@ -405,12 +408,16 @@ impl Pipeline {
     }
 
     fn look(&mut self, pair: &Stamped<StereoPair>, pose: &Pose) -> Vec<Output> {
-        let Some(seen) = self.vision.look(pair, &mut self.counters) else {
+        let rig = Arc::clone(&self.rig);
+        let view = View::new(&rig, pose, &self.shared, &self.datum);
+        let ground = self
+            .bounded
+            .then(|| ground_scale(&view, self.terrain.as_deref()));
+        let looked = self.vision.look(pair, ground.flatten(), &mut self.counters);
+        let Some(seen) = looked else {
             self.blind = Some("the latest pair could not be looked at".to_owned());
             return Vec::new();
         };
-        let rig = Arc::clone(&self.rig);
-        let view = View::new(&rig, pose, &self.shared, &self.datum);
         self.degraded = pose.degraded.iter().map(|reason| reason.name()).collect();
         if seen.mono {
             self.degraded.push(crate::pose::Degraded::Mono.name());
@@ -661,14 +668,32 @@ impl AutopilotLock {
 
 /// Disparity of the ground behind a pixel of the rectified left image.
 fn promised(pixel: RectifiedPixel, view: &View<'_>, terrain: Option<&dyn Terrain>) -> Option<f64> {
+    let depth_m = ground_depth_m(pixel, view, terrain?)?;
+    Some(view.rig.disparity_px(depth_m))
+}
+
+/// Depth along the boresight of the ground behind a pixel of the rectified left image, metres.
+fn ground_depth_m(pixel: RectifiedPixel, view: &View<'_>, terrain: &dyn Terrain) -> Option<f64> {
     let ray = view.ray_enu(pixel);
-    match meet_terrain(&view.camera_enu, &ray, terrain?, view) {
+    match meet_terrain(&view.camera_enu, &ray, terrain, view) {
         TerrainHit::Met { range_m, .. } => {
             let depth_m = view.enu_from_cam.column(2).dot(&ray) * range_m;
-            (depth_m > 0.0).then(|| view.rig.disparity_px(depth_m))
+            (depth_m > 0.0).then_some(depth_m)
         }
         _ => None,
     }
+}
+
+/// How large things on the ground appear over the raw left image.
+fn ground_scale(view: &View<'_>, terrain: Option<&dyn Terrain>) -> Option<GroundScale> {
+    let terrain = terrain?;
+    let camera = view.rig.camera(Eye::Left);
+    let rectification = view.rig.rectification();
+    Some(GroundScale::sampled(camera.image_size_px, |u, v| {
+        let raw = [RawPixel { u, v }];
+        let pixel = *rectification.rectify(Eye::Left, &raw).ok()?.first()?;
+        Some(camera.focal_px.0 / ground_depth_m(pixel, view, terrain)?)
+    }))
 }
 
 /// Ellipsoid height minus altitude, where a receiver gives both.

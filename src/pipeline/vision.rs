@@ -3,7 +3,7 @@
 use super::{Counters, light};
 use crate::alarm::AlarmClass;
 use crate::assess::PLAIN_LEVEL;
-use crate::detect::{BoxPx, Detection, DetectionClass, Detector, LeftImage};
+use crate::detect::{BoxPx, Detection, DetectionClass, Detector, GroundScale, LeftImage};
 use crate::ingest::{EncodedImage, EyeHealth, EyeWatch, ImageDecoder, StereoPair};
 use crate::locate::{DisparityOf, Sighting};
 use crate::range::{Disparity, EyeComparer, EyesCompared, Ranger, Ranging, RawPair, Target};
@@ -73,13 +73,20 @@ impl Vision {
         }
     }
 
-    /// Looks at a pair. `None` when the left eye shows nothing that can be trusted; why is counted.
-    pub fn look(&mut self, pair: &Stamped<StereoPair>, counters: &mut Counters) -> Option<Seen> {
+    /// Looks at a pair; `ground` is how large things on the ground appear in its left image, where
+    /// that is known. `None` when the left eye shows nothing that can be trusted; why is counted.
+    pub fn look(
+        &mut self,
+        pair: &Stamped<StereoPair>,
+        ground: Option<GroundScale>,
+        counters: &mut Counters,
+    ) -> Option<Seen> {
         let bgr = self.left(&pair.value.left, counters)?;
         let image = LeftImage {
             at: pair.at,
             sequence: pair.value.sequence,
             bgr,
+            ground,
         };
         let found = match self.detector.detect(&image) {
             Ok(found) => found,

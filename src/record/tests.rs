@@ -79,6 +79,7 @@ fn record(path: &Path, options: &RecordOptions) {
             class: DetectionClass::Fire,
             score: 0.9,
             box_px,
+            mask: None,
         };
         tape.write_detections(exposed, &[detection]).unwrap();
         let fix = serde_json::json!({"type": "Feature", "geometry": null,

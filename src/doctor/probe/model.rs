@@ -43,6 +43,7 @@ fn median_look(detector: &mut OnnxDetector, size: (u32, u32)) -> Result<Duration
         at: ServiceTime::from_unix_ns(0),
         sequence: 0,
         bgr,
+        ground: None,
     };
     let mut took = Vec::with_capacity(LOOKS);
     for _ in 0..LOOKS {
