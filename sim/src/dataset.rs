@@ -6,7 +6,8 @@
 //! empty file is a picture without either).
 //!
 //! Most pictures are cut from the raw left image at its own scale; some are the whole image, shrunk
-//! and letter-boxed. The same rig, count and seed give the same bytes.
+//! and letter-boxed. Or, by [`Framing::Whole`], each is the raw left image as it is. The same rig, count,
+//! seed and framing give the same bytes.
 //! **Known limits.** One lens and one kind of flame: real pictures must be mixed in.
 
 use crate::render::{
@@ -63,6 +64,15 @@ pub enum DatasetError {
     },
 }
 
+/// What of the raw left image a picture shows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Framing {
+    /// What a detector gets to see: a cut-out, or all of it shrunk.
+    Cut,
+    /// All of it at its own scale.
+    Whole,
+}
+
 /// What was written.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct DatasetSummary {
@@ -87,6 +97,7 @@ pub fn write(
     pictures: usize,
     seed: u64,
     rig: &Rig,
+    framing: Framing,
 ) -> Result<DatasetSummary, DatasetError> {
     let camera = StereoCamera::new(rig);
     let (width, height) = camera.image_size_px(Eye::Left);
@@ -102,7 +113,8 @@ pub fn write(
         .into_par_iter()
         .map(|k| {
             let numbers = k * POSES..((k + 1) * POSES).min(pictures);
-            write_world(dir, numbers, seed.wrapping_add((k as u64) << 20), &camera)
+            let seed = seed.wrapping_add((k as u64) << 20);
+            write_world(dir, numbers, seed, &camera, framing)
         })
         .collect();
     Ok(summaries?
@@ -139,6 +151,7 @@ fn write_world(
     numbers: std::ops::Range<usize>,
     seed: u64,
     camera: &StereoCamera,
+    framing: Framing,
 ) -> Result<DatasetSummary, DatasetError> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let config = random_world(&mut rng);
@@ -154,7 +167,10 @@ fn write_world(
         let body = random_pose(&mut rng, &config, renderer.world(), camera);
         let frame = renderer.render(Eye::Left, &body, t_s);
         let boxes = renderer.label_boxes(&body, t_s);
-        let picture = cut(&mut rng, &frame, &boxes);
+        let picture = match framing {
+            Framing::Cut => cut(&mut rng, &frame, &boxes),
+            Framing::Whole => whole(frame, &boxes),
+        };
         summary.count(&picture.labels);
         save(dir, number, &picture, rng.random_range(70..=95))?;
     }
@@ -185,7 +201,7 @@ struct Picture {
     labels: Vec<YoloBox>,
 }
 
-/// Edges as shares of the picture's side.
+/// Edges as shares of the picture's width and height.
 struct YoloBox {
     class: BurningClass,
     left: f64,
@@ -213,13 +229,15 @@ impl YoloBox {
 struct Window {
     scale: f64,
     shift: (f64, f64),
+    /// Columns and rows of the picture.
+    size: (f64, f64),
     /// Rows of the picture that hold the image; columns always do.
     rows: (f64, f64),
 }
 
 impl Window {
     fn label(&self, label: &LabelBox) -> Option<YoloBox> {
-        let side = f64::from(SIDE);
+        let (width, height) = self.size;
         // Half a pixel: label edges count from the first pixel's centre, shares from its edge.
         let across = |px: f64| (px + 0.5) * self.scale + self.shift.0;
         let down = |px: f64| (px + 0.5) * self.scale + self.shift.1;
@@ -228,7 +246,7 @@ impl Window {
             * self.scale.powi(2);
         let (left, right) = (
             across(label.left_px).max(0.0),
-            across(label.right_px).min(side),
+            across(label.right_px).min(width),
         );
         let (top, bottom) = (
             down(label.top_px).max(self.rows.0),
@@ -238,10 +256,10 @@ impl Window {
         let big = right - left >= LEAST_PX && bottom - top >= LEAST_PX;
         (big && seen >= LEAST_SHARE * whole).then(|| YoloBox {
             class: label.class,
-            left: left / side,
-            top: top / side,
-            right: right / side,
-            bottom: bottom / side,
+            left: left / width,
+            top: top / height,
+            right: right / width,
+            bottom: bottom / height,
         })
     }
 }
@@ -251,6 +269,21 @@ fn cut(rng: &mut ChaCha8Rng, frame: &Frame, boxes: &[LabelBox]) -> Picture {
         letter_boxed(frame)
     } else {
         cropped(rng, frame, boxes)
+    };
+    let labels = boxes
+        .iter()
+        .filter_map(|label| window.label(label))
+        .collect();
+    Picture { frame, labels }
+}
+
+fn whole(frame: Frame, boxes: &[LabelBox]) -> Picture {
+    let size = (f64::from(frame.width), f64::from(frame.height));
+    let window = Window {
+        scale: 1.0,
+        shift: (0.0, 0.0),
+        size,
+        rows: (0.0, size.1),
     };
     let labels = boxes
         .iter()
@@ -275,6 +308,7 @@ fn letter_boxed(frame: &Frame) -> (Frame, Window) {
         Window {
             scale,
             shift: (x, y),
+            size: (f64::from(SIDE), f64::from(SIDE)),
             rows: (y, y + f64::from(height)),
         },
     )
@@ -333,6 +367,7 @@ fn cropped(rng: &mut ChaCha8Rng, frame: &Frame, boxes: &[LabelBox]) -> (Frame, W
         Window {
             scale: 1.0,
             shift,
+            size: (f64::from(SIDE), f64::from(SIDE)),
             rows: (0.0, f64::from(SIDE)),
         },
     )
@@ -572,8 +607,11 @@ mod tests {
     #[test]
     fn the_same_seed_writes_the_same_labelled_pictures() {
         let (one, two) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
-        let summary = write(one.path(), 5, 3, &rig()).unwrap();
-        assert_eq!(summary, write(two.path(), 5, 3, &rig()).unwrap());
+        let summary = write(one.path(), 5, 3, &rig(), Framing::Cut).unwrap();
+        assert_eq!(
+            summary,
+            write(two.path(), 5, 3, &rig(), Framing::Cut).unwrap()
+        );
         assert_eq!(summary.pictures, 5);
         for number in 0..5 {
             for name in [
@@ -591,6 +629,7 @@ mod tests {
         let window = Window {
             scale: 1.0,
             shift: (-100.0, -50.0),
+            size: (f64::from(SIDE), f64::from(SIDE)),
             rows: (0.0, 416.0),
         };
         let label = |left_px: f64| LabelBox {

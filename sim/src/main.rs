@@ -3,6 +3,7 @@
 use anyhow::Context;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use emberfix_sim::autopilot::ErrorsConfig;
+use emberfix_sim::dataset::Framing;
 use emberfix_sim::demo::{Demo, DemoError, Progress, Report};
 use emberfix_sim::live::{Control, Edges, LiveFlight};
 use emberfix_sim::mission::Mission;
@@ -49,6 +50,9 @@ struct FlyArgs {
     /// Pictures of the data set
     #[arg(long, default_value_t = 1000, requires = "dataset")]
     frames: usize,
+    /// Whole raw left images instead of what a detector gets to see of them
+    #[arg(long, requires = "dataset")]
+    whole_frames: bool,
     /// Seed instead of the mission's
     #[arg(long)]
     seed: Option<u64>,
@@ -155,7 +159,12 @@ fn refuse(error: &dyn std::error::Error) -> ExitCode {
 
 fn fly(args: &FlyArgs, mission: &Mission) -> anyhow::Result<()> {
     if let Some(folder) = &args.dataset {
-        return write_dataset(folder, args.frames, mission);
+        let framing = if args.whole_frames {
+            Framing::Whole
+        } else {
+            Framing::Cut
+        };
+        return write_dataset(folder, args.frames, framing, mission);
     }
     let errors = args.errors.of(mission);
     match &args.record {
@@ -164,8 +173,13 @@ fn fly(args: &FlyArgs, mission: &Mission) -> anyhow::Result<()> {
     }
 }
 
-fn write_dataset(folder: &Path, frames: usize, mission: &Mission) -> anyhow::Result<()> {
-    let written = dataset::write(folder, frames, mission.sim.seed, &mission.rig)?;
+fn write_dataset(
+    folder: &Path,
+    frames: usize,
+    framing: Framing,
+    mission: &Mission,
+) -> anyhow::Result<()> {
+    let written = dataset::write(folder, frames, mission.sim.seed, &mission.rig, framing)?;
     eprintln!("{}: {written:?}", folder.display());
     Ok(())
 }

@@ -9,6 +9,7 @@
 pub mod boresight;
 pub mod calibration;
 pub mod delivery;
+pub mod detector;
 pub mod ground;
 pub mod location;
 pub mod range;

@@ -2,6 +2,7 @@
 
 mod calibration;
 mod delivery;
+mod detector;
 mod ground;
 mod location;
 mod range;
@@ -58,6 +59,8 @@ fn drawn(table: &crate::eval::Table) -> Table {
 /// What can be measured.
 #[derive(Debug, clap::Subcommand)]
 pub enum Eval {
+    /// How well a detector finds fire in labelled pictures.
+    Detector(detector::DetectorArguments),
     /// Position and its error over simulated flights, without pictures.
     Location(location::LocationArguments),
     /// Every way to range a flame, on rendered flames with truth.
@@ -78,6 +81,7 @@ pub enum Eval {
 /// Measures one of them.
 pub fn eval(what: &Eval) -> Result<(), Failure> {
     match what {
+        Eval::Detector(arguments) => detector::detector(arguments),
         Eval::Location(arguments) => location::location(arguments),
         Eval::Range(arguments) => range::range(arguments),
         Eval::Trend(arguments) => trend::trend(arguments),
