@@ -25,6 +25,8 @@ const AGREE_SIGMAS: f64 = 3.0;
 /// flames (the tuning set of `emberfix eval range`) it is 0.27 between correlation and centroids, and less
 /// between either and features.
 const ALIKE: f64 = 0.25;
+/// Chi-square for each voice beyond the first that chance still explains: one time in six it is greater.
+const BY_CHANCE: f64 = 2.0;
 /// A single voice that is not sure is believed this much less.
 const ALONE: f64 = 2.0;
 /// A correlation above this needs no other voice, unless one contradicts.
@@ -165,13 +167,13 @@ fn together_px(voices: &[Voice]) -> f64 {
     (ALIKE * sum * sum + (1.0 - ALIKE) * squares).sqrt() / squares
 }
 
-/// How much further apart the voices are than they say (Birge's ratio), at least 1: agreement by chance
-/// narrows nothing.
+/// How much further apart the voices are than they say and chance explains (after Birge's ratio), at least 1:
+/// agreement by chance narrows nothing.
 fn disagreement(voices: &[Voice], mean_px: f64) -> f64 {
     let squares = voices
         .iter()
         .map(|voice| voice.weight() * (voice.found.px - mean_px).powi(2));
-    (squares.sum::<f64>() / (voices.len() - 1) as f64)
+    (squares.sum::<f64>() / (BY_CHANCE * (voices.len() - 1) as f64))
         .sqrt()
         .max(1.0)
 }

@@ -35,7 +35,7 @@ const SURE: f64 = 0.9;
 /// How its error follows from what it saw: the eyes draw the edge of brightness at other levels.
 const FACTORS: Factors = Factors {
     scatter: 0.75,
-    unlike: (0.105, 0.0),
+    unlike: 0.105,
     least_px: 0.13,
 };
 /// Bands of rows whose scatter is the error.
@@ -73,7 +73,7 @@ pub(super) fn find(scene: &Scene<'_>, config: &RangeConfig) -> Result<Matched, M
     Ok(Matched {
         found: disparity(&bright, &refined),
         likeness: best.correlation,
-        dullness: 0.0,
+        dullness: 1.0,
         factors: &FACTORS,
     })
 }

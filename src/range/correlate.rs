@@ -14,13 +14,13 @@ const OUTLINE_PX: usize = 2;
 const RIM_PX: usize = 1;
 /// How its error follows from what it saw.
 const FACTORS: Factors = Factors {
-    scatter: 0.48,
-    unlike: (0.03, 0.22),
-    least_px: 0.048,
+    scatter: 0.49,
+    unlike: 0.43,
+    least_px: 0.044,
 };
 /// The same between two spectra, where grey levels are unlike anyway: a third of it is the flame's doing.
 const TWO_SPECTRA: Factors = Factors {
-    unlike: (0.01, 0.07),
+    unlike: 0.14,
     ..FACTORS
 };
 /// Disagreement of the search there and back that is none.

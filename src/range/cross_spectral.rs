@@ -24,11 +24,10 @@ const LEAST_LIKENESS: f64 = 0.25;
 /// Pixels that are compared, at most.
 const MOST_PIXELS: usize = 1600;
 
-/// How its error follows from what it saw. Equal bits are few even between alike eyes: alone they tell nothing
-/// of the error.
+/// How its error follows from what it saw; equal bits are few even between alike eyes.
 const FACTORS: Factors = Factors {
-    scatter: 1.0,
-    unlike: (0.0, 0.026),
+    scatter: 0.95,
+    unlike: 0.026,
     least_px: 0.02,
 };
 

@@ -2,9 +2,9 @@
 //!
 //! - **Scatter**: noise, and parts of the flame at depths of their own. Each method sees it on the spot, in
 //!   how its parts or bands disagree; neighbours err alike, so that a factor makes one sigma of it.
-//! - **Unlikeness**: where the eyes show different flames (exposed apart, smoke or a branch before one of
-//!   them, dirt on a lens), outlines that match lie apart by a share of the flame's width: the more is
-//!   missing to full likeness, and the more so where one eye is duller than the other.
+//! - **Unlikeness**: where one eye shows less of the flame than the other (smoke or a branch before it, dirt
+//!   on its lens), outlines that match lie apart by a share of the flame's width: the more is missing to full
+//!   likeness, and the duller the one eye is against the other.
 //! - **Depth**: what shines lies before and behind the flame's axis, which the disparity is meant for. It
 //!   is the same for every method, so that asking another one does not lessen it.
 //! - **Sampling**: what pixels and interpolation leave, however much is seen.
@@ -22,7 +22,7 @@ pub(super) struct Matched {
     pub found: Disparity,
     /// How much of the target the other eye shows as well, 0 to 1.
     pub likeness: f64,
-    /// By what share one eye is duller than the other, 0 to 1.
+    /// By what share one eye is duller than the other, 0 to 1; 1 where a method can't tell.
     pub dullness: f64,
     /// What the method makes of them.
     pub factors: &'static Factors,
@@ -33,8 +33,8 @@ pub(super) struct Matched {
 pub(super) struct Factors {
     /// Of the stated scatter.
     pub scatter: f64,
-    /// Share of the width per likeness that is missing: with eyes equally sharp, and more by dullness.
-    pub unlike: (f64, f64),
+    /// Share of the width for likeness that is missing altogether to an eye that is dull altogether.
+    pub unlike: f64,
     /// Sampling, pixels.
     pub least_px: f64,
 }
@@ -48,20 +48,21 @@ pub(super) struct Sigma {
     pub shared_px: f64,
 }
 
-/// Between the light that is seen of a flame and its axis, one sigma, as a share of the flame's width. In
-/// rendered flames the light lies 0.033 widths before the axis (soot hides the soot behind it) with a
-/// scatter of 0.055 (in still air) to 0.080 (leaning in the wind).
-const DEPTH: f64 = 0.085;
+/// Between what matches of a flame and its axis, one sigma, as a share of the flame's width. In rendered
+/// flames the light lies 0.035 widths before the axis (soot hides the soot behind it) with a scatter of
+/// 0.055 (in still air) to 0.080 (leaning in the wind); the outlines that match are of single tongues and
+/// scatter more.
+const DEPTH: f64 = 0.11;
 
 impl Matched {
     /// What its error comes to, for a target whose width is as much disparity as `depth_px`.
     pub fn sigma(&self, width_px: f64, depth_px: f64) -> Sigma {
         let Factors {
             scatter,
-            unlike: (unlike, by_dullness),
+            unlike,
             least_px,
         } = *self.factors;
-        let apart = (1.0 - self.likeness).max(0.0) * (unlike + by_dullness * self.dullness);
+        let apart = unlike * (1.0 - self.likeness).max(0.0) * self.dullness;
         let own_px = (scatter * self.found.sigma_px)
             .hypot(apart * width_px)
             .hypot(least_px);

@@ -91,7 +91,7 @@ const UNSETTLED_PX: f64 = 1.7;
 /// How its error follows from that: whole pixels pull at its disparities, whatever agrees.
 const FACTORS: Factors = Factors {
     scatter: 1.0,
-    unlike: (0.0, 0.0),
+    unlike: 0.0,
     least_px: 0.12,
 };
 /// Share of the flame that must have a valid disparity: where less has, the eyes show it differently.
