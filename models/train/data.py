@@ -20,6 +20,7 @@ from torch.utils.data import IterableDataset
 
 from . import synth
 
+THERMAL_SETS = ("fcdnet_thermal",)
 RGB_SETS = ("continuous_fire6", "abonia_cctv", "dfire_none99")
 GREY = 114
 
@@ -145,11 +146,17 @@ def flame_cover(crop: np.ndarray) -> np.ndarray:
     return cv2.GaussianBlur(np.maximum(warm, white), (0, 0), 0.8)
 
 
-class Mixer:
-    """Draws augmented training samples from the pools."""
+# How often a sample is of each kind; kinds that lack pictures leave their share to the others.
+SHARES = {"extra": 0.20, "drawn": 0.08, "paste": 0.12, "mosaic": 0.18, "single": 0.42}
 
-    def __init__(self, real: list[Picture], drawn: list[Picture], extra: list[Picture], side: int) -> None:
-        self.side = side
+
+class Mixer:
+    """Draws augmented training samples from the pools. Flames are pasted and lamps added in visible
+    light only: to a thermal camera a lamp is as warm as it looks."""
+
+    def __init__(self, real: list[Picture], drawn: list[Picture], extra: list[Picture], side: int,
+                 visible: bool = True, shares: dict[str, float] = SHARES) -> None:
+        self.side, self.visible = side, visible
         self.drawn, self.extra = drawn, extra
         by_set: dict[str, dict[str, list[Picture]]] = defaultdict(lambda: defaultdict(list))
         for p in real:
@@ -163,6 +170,11 @@ class Mixer:
         self.clip_p = [p / p.sum() for p in self.clip_p]
         self.calm = [p for p in real + drawn if len(p.boxes) == 0 and p.smoke]
         self.fires = [p for p in real if (p.boxes[:, 0] == 0).any() and not p.name.startswith("abonia")]
+        there = {"extra": extra, "drawn": drawn, "paste": visible and self.calm and self.fires,
+                 "mosaic": real, "single": real}
+        self.kinds = [k for k in shares if there[k]]
+        self.kind_p = np.array([shares[k] for k in self.kinds])
+        self.kind_p /= self.kind_p.sum()
 
     def real(self, rng: Generator) -> Picture:
         i = rng.choice(len(self.sets), p=self.set_p)
@@ -242,19 +254,19 @@ class Mixer:
     def sample(self, rng: Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Picture [side, side, 3] uint8 BGR, boxes [n, 5] px, valid [side/8, side/8] uint8."""
         c = Canvas(self.side)
-        kind = rng.random()
-        if self.extra and kind < 0.22:
-            p = self.extra[rng.integers(len(self.extra))]
-            self.tile(rng, c, p) if rng.random() < 0.75 else self.single(rng, c, p, 0.9, 1.3)
-        elif kind < (0.34 if self.extra else 0.2) and self.drawn:
-            self.single(rng, c, self.drawn[rng.integers(len(self.drawn))], 0.7, 1.6)
-        elif kind < (0.46 if self.extra else 0.35):
-            self.paste(rng, c)
-        elif kind < (0.60 if self.extra else 0.55):
-            self.mosaic(rng, c)
-        else:
-            self.single(rng, c, self.real(rng), 0.6, 1.4)
-        if rng.random() < 0.2:
+        match self.kinds[rng.choice(len(self.kinds), p=self.kind_p)]:
+            case "extra":
+                p = self.extra[rng.integers(len(self.extra))]
+                self.tile(rng, c, p) if rng.random() < 0.75 else self.single(rng, c, p, 0.9, 1.3)
+            case "drawn":
+                self.single(rng, c, self.drawn[rng.integers(len(self.drawn))], 0.7, 1.6)
+            case "paste":
+                self.paste(rng, c)
+            case "mosaic":
+                self.mosaic(rng, c)
+            case _:
+                self.single(rng, c, self.real(rng), 0.6, 1.4)
+        if self.visible and rng.random() < 0.2:
             lamps(rng, c.image)
         img = photometric(rng, c.image)
         boxes = np.array(c.boxes, np.float32).reshape(-1, 5)

@@ -18,7 +18,7 @@ import numpy as np
 import onnxruntime
 
 from . import data, metrics
-from .model import BINS, INPUT, NAMES, cells
+from .model import BINS, INPUT, cells
 
 SIZES = {"under 32 px": (0.0, 32.0), "32 to 96 px": (32.0, 96.0), "over 96 px": (96.0, np.inf)}
 
@@ -31,6 +31,7 @@ class Detector:
         options.intra_op_num_threads = 1
         self.session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
         self.meta = self.session.get_modelmeta().custom_metadata_map
+        self.names = list(json.loads(self.meta["names"]).values())
         self.mean, self.std = (np.array(json.loads(self.meta[k]), np.float32) for k in ("mean", "std"))
         centres, strides = cells(INPUT, INPUT)
         self.centres, self.strides = centres.numpy(), strides.numpy()
@@ -39,7 +40,7 @@ class Detector:
         """A 416 x 416 BGR uint8 picture."""
         x = ((image.astype(np.float32) - self.mean) / self.std).transpose(2, 0, 1)[None]
         y = self.session.run(None, {"data": np.ascontiguousarray(x)})[0][0]
-        nc = len(NAMES)
+        nc = len(self.names)
         bins = y[:, nc:].reshape(-1, 4, BINS)
         bins = np.exp(bins - bins.max(-1, keepdims=True))
         side = (bins / bins.sum(-1, keepdims=True)) @ np.arange(BINS, dtype=np.float32) * self.strides[:, None]
@@ -67,7 +68,7 @@ class Detector:
                 parts.append(found)
         boxes, score, cls = (np.concatenate([getattr(p, k) for p in parts]) for k in ("boxes", "score", "cls"))
         keep = np.concatenate([np.flatnonzero(cls == c)[metrics.nms(boxes[cls == c], score[cls == c], 0.5)]
-                               for c in range(len(NAMES))])
+                               for c in range(len(self.names))])
         keep = keep[np.argsort(-score[keep], kind="stable")]
         return metrics.Found(boxes[keep], score[keep], cls[keep])
 
@@ -168,7 +169,8 @@ def main() -> None:
     pictures: list[data.Picture] = []
     found: list[metrics.Found] = []
     if args.data:
-        pictures += data.read_split(args.data, args.split)
+        sets = data.RGB_SETS if len(detector.names) > 1 else data.THERMAL_SETS
+        pictures += data.read_split(args.data, args.split, sets)
     if args.drawn:
         pictures += data.draw(args.drawn, 20_000)
     found = [detector.fitted(p.image) for p in pictures]
@@ -205,7 +207,7 @@ def main() -> None:
     seen = sum(bool(at_threshold([f], [t], 0, threshold)["recall"]) for f, t in lit)
     fired = sum(bool(((f.cls == 0) & (f.score >= threshold)).any()) for f, _ in lit)
     print(f"  pictures with fire: {len(lit)}; with a correct box {seen / max(len(lit), 1):.3f}, with any fire box {fired / max(len(lit), 1):.3f}")
-    for c, name in enumerate(NAMES):
+    for c, name in enumerate(detector.names):
         bad, n = false_boxes(found, truth, threshold, c)
         print(f"false {name} boxes on {n} negatives: {bad} ({100 * bad / max(n, 1):.1f} per 100)")
     boxes = sum(int((t[:, 0] == 1).sum()) for t in smoke_truth)

@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from . import data, metrics
 from .loss import losses
-from .model import INPUT, MEAN, STD, EmberNano, cells, decode
+from .model import INPUT, MEAN, NAMES, STD, EmberNano, cells, decode
 
 
 def normalise(images: Tensor) -> Tensor:
@@ -75,12 +75,28 @@ def curves(rows: list[dict[str, float]], path: Path) -> None:
     plt.close(fig)
 
 
+def groups(model: EmberNano, scratch: bool) -> list[dict]:
+    """Parameters by weight decay and by share of the learning rate: what ImageNet taught moves slowly."""
+    out = []
+    for part, share in ((model.trunk, 1.0 if scratch else 0.3), (None, 1.0)):
+        own = [p for n, p in model.named_parameters() if n.startswith("trunk.") == (part is not None)]
+        own = [p for p in own if p.requires_grad]
+        out += [
+            {"params": [p for p in own if p.ndim > 1], "weight_decay": 0.02, "share": share},
+            {"params": [p for p in own if p.ndim <= 1], "weight_decay": 0.0, "share": share},
+        ]
+    return out
+
+
 def main() -> None:
     ap = argparse.ArgumentParser(description=__doc__)
     ap.add_argument("--data", type=Path, required=True, help="folder with manifest.csv and splits/")
     ap.add_argument("--out", type=Path, required=True, help="outside the project: checkpoints, log, curves")
     ap.add_argument("--extra", type=Path, action="append", default=[], help="more YOLO folders, e.g. simulated frames")
+    ap.add_argument("--extra-share", type=float, default=data.SHARES["extra"], help="of the samples, from --extra")
+    ap.add_argument("--thermal", action="store_true", help="learn ember-thermal: fire alone, on the thermal set")
     ap.add_argument("--init", type=Path, help="start from the EMA weights of this checkpoint")
+    ap.add_argument("--scratch", action="store_true", help="random weights instead of ImageNet's, for comparison")
     ap.add_argument("--steps", type=int, default=6000)
     ap.add_argument("--minutes", type=float, default=1e9, help="the schedule ends by then even if steps remain")
     ap.add_argument("--batch", type=int, default=24)
@@ -97,19 +113,25 @@ def main() -> None:
     args.out.mkdir(parents=True, exist_ok=True)
     started = time.monotonic()
 
-    real = data.read_split(args.data, "train")
-    val = data.read_split(args.data, "val")
+    sets = data.THERMAL_SETS if args.thermal else data.RGB_SETS
+    if args.thermal:
+        args.drawn = 0
+    real = data.read_split(args.data, "train", sets)
+    val = data.read_split(args.data, "val", sets)
     drawn = data.draw(args.drawn, args.seed, args.out.parent / f"drawn-{args.seed}-{args.drawn}.npz") if args.drawn else []
-    check = data.draw(60, 10_000, args.out.parent / "drawn-check.npz")
+    check = data.draw(60, 10_000, args.out.parent / "drawn-check.npz") if args.drawn else []
     extra = [p for d in args.extra for p in data.read_yolo(d)]
     extra, extra_check = [p for i, p in enumerate(extra) if i % 12], extra[::12]
     print(f"train {len(real)}, drawn {len(drawn)}, extra {len(extra)}, val {len(val)}", flush=True)
 
-    model = EmberNano().to(memory_format=torch.channels_last)
-    decay = [p for p in model.parameters() if p.ndim > 1]
-    plain = [p for p in model.parameters() if p.ndim <= 1]
-    groups = [{"params": decay, "weight_decay": 0.02}, {"params": plain, "weight_decay": 0.0}]
-    optimiser = torch.optim.AdamW(groups, lr=args.lr, betas=(0.9, 0.99))
+    model = EmberNano(1 if args.thermal else len(NAMES))
+    if not args.scratch:
+        model.trunk.start_from_imagenet()
+    model = model.to(memory_format=torch.channels_last)
+    still = [] if args.scratch else model.trunk.frozen()
+    for part in still:
+        part.requires_grad_(False)
+    optimiser = torch.optim.AdamW(groups(model, args.scratch), lr=args.lr, betas=(0.9, 0.99))
     step, spent, best, rows = 0, 0.0, -1.0, []
     last = args.out / "last.pt"
     if last.exists():
@@ -123,7 +145,9 @@ def main() -> None:
     if last.exists():
         ema.load_state_dict(state["ema"])
 
-    mixer = data.Mixer(real, drawn, extra, args.side)
+    others = (1 - args.extra_share) / (1 - data.SHARES["extra"])
+    shares = {k: v * others for k, v in data.SHARES.items()} | {"extra": args.extra_share}
+    mixer = data.Mixer(real, drawn, extra, args.side, not args.thermal, shares)
     loader = torch.utils.data.DataLoader(
         data.Batches(mixer, args.batch, args.seed, step), batch_size=None, num_workers=args.workers,
         prefetch_factor=4 if args.workers else None,
@@ -140,8 +164,10 @@ def main() -> None:
         done = max((step + 1) / args.steps, spent / 60 / args.minutes)
         rate = args.lr * min(1.0, (step + 1) / 200) * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * min(done, 1))))
         for g in optimiser.param_groups:
-            g["lr"] = rate
+            g["lr"] = rate * g["share"]
         model.train()
+        for part in still:
+            part.eval()  # batch statistics stay ImageNet's too
         out = model.logits(normalise(images))
         parts = losses(out, boxes, valid, model.nc, args.side, args.side)
         optimiser.zero_grad()
@@ -162,21 +188,22 @@ def main() -> None:
             sums, since = {}, 0
             pool = val if done >= 1.0 else thin(val, 150)
             row["val"] = fire_ap(detect(ema, pool), pool)
-            row["synth"] = fire_ap(detect(ema, check), check)
+            if check:
+                row["synth"] = fire_ap(detect(ema, check), check)
             if extra_check:
                 row["extra"] = fire_ap(detect(ema, thin(extra_check, 40), 640), thin(extra_check, 40))
             rows.append(row)
             print("\n" + " ".join(f"{k} {v:.4g}" for k, v in row.items()), flush=True)
             curves(rows, args.out / "curves.png")
             state = {"model": model.state_dict(), "ema": ema.state_dict(), "optimiser": optimiser.state_dict(),
-                     "step": step, "spent": spent, "seed": args.seed, "rows": json.dumps(rows)}
+                     "classes": model.nc, "step": step, "spent": spent, "seed": args.seed, "rows": json.dumps(rows)}
             better = row["val"] >= best
             best = max(best, row["val"])
             state["best"] = best
             torch.save(state, last.with_suffix(".tmp"))
             last.with_suffix(".tmp").replace(last)
             if better:
-                torch.save({"ema": ema.state_dict(), "seed": args.seed, "step": step}, args.out / "best.pt")
+                torch.save({"ema": ema.state_dict(), "classes": model.nc, "seed": args.seed, "step": step}, args.out / "best.pt")
     bar.close()
     print(f"done in {(time.monotonic() - started) / 60:.1f} min, best val fire AP50 {best:.3f}")
 

@@ -10,60 +10,19 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from .trunk import MEAN, STD, Trunk, conv
+
 NAMES = ("fire", "smoke")
 STRIDES = (8, 16, 32, 64)
 BINS = 8  # distance = stride * sum(softmax(logits) * 0..7)
 INPUT = 416  # px, side of the square input
-MEAN = (103.53, 116.28, 123.675)  # B, G, R
-STD = (57.375, 57.12, 58.395)
 
-
-def conv(cin: int, cout: int, k: int = 1, s: int = 1, groups: int = 1, act: bool = True) -> nn.Sequential:
-    """Convolution, batch norm and (by default) leaky ReLU; keeps H, W when s is 1."""
-    layers: list[nn.Module] = [
-        nn.Conv2d(cin, cout, k, s, k // 2, groups=groups, bias=False),
-        nn.BatchNorm2d(cout, momentum=0.03, eps=1e-3),
-    ]
-    if act:
-        layers.append(nn.LeakyReLU(0.1, inplace=True))
-    return nn.Sequential(*layers)
+__all__ = ["BINS", "INPUT", "MEAN", "NAMES", "STD", "STRIDES", "EmberNano", "cells", "decode"]
 
 
 def separable(cin: int, cout: int, k: int = 3, s: int = 1) -> nn.Sequential:
     """Depthwise k x k followed by pointwise 1 x 1."""
     return nn.Sequential(conv(cin, cin, k, s, groups=cin, act=False), conv(cin, cout))
-
-
-class Residual(nn.Module):
-    """Inverted residual: 1x1 widen, depthwise 3x3, 1x1 project; skip when the shape is kept."""
-
-    def __init__(self, cin: int, cout: int, s: int = 1, widen: int = 2) -> None:
-        super().__init__()
-        mid = cin * widen
-        self.skip = s == 1 and cin == cout
-        self.body = nn.Sequential(
-            conv(cin, mid), conv(mid, mid, 3, s, groups=mid, act=False), conv(mid, cout, act=False)
-        )
-
-    def forward(self, x: Tensor) -> Tensor:
-        y = self.body(x)
-        return x + y if self.skip else nn.functional.leaky_relu(y, 0.1)
-
-
-class Pooling(nn.Module):
-    """Fast spatial pyramid: three chained 5x5 max pools, so large flames see their surroundings."""
-
-    def __init__(self, c: int) -> None:
-        super().__init__()
-        self.reduce = conv(c, c // 2)
-        self.pool = nn.MaxPool2d(5, 1, 2)
-        self.merge = conv(c * 2, c)
-
-    def forward(self, x: Tensor) -> Tensor:
-        a = self.reduce(x)
-        b = self.pool(a)
-        c = self.pool(b)
-        return self.merge(torch.cat((a, b, c, self.pool(c)), 1))
 
 
 class Head(nn.Module):
@@ -81,28 +40,22 @@ class Head(nn.Module):
 
 
 class EmberNano(nn.Module):
-    """Backbone (strides 2..32), PAN neck with one extra level (64), and a head per level."""
+    """Trunk (strides 2..32), path-aggregation neck with one extra level (64), a head per level."""
 
-    def __init__(self, nc: int = len(NAMES), neck: int = 64) -> None:
+    def __init__(self, nc: int = len(NAMES), neck: int = 72) -> None:
         super().__init__()
-        self.stem = nn.Sequential(conv(3, 16, 3, 2), separable(16, 24, 3, 2))
-        self.stage8 = nn.Sequential(Residual(24, 48, 2), Residual(48, 48), Residual(48, 48))
-        self.stage16 = nn.Sequential(Residual(48, 96, 2), *(Residual(96, 96) for _ in range(3)))
-        self.stage32 = nn.Sequential(Residual(96, 160, 2), Residual(160, 160), Pooling(160))
-        self.lateral = nn.ModuleList(conv(c, neck) for c in (48, 96, 160))
-        self.up = nn.ModuleList(separable(2 * neck, neck) for _ in range(2))
-        self.down = nn.ModuleList(separable(neck, neck, 3, 2) for _ in range(2))
-        self.fuse = nn.ModuleList(separable(2 * neck, neck) for _ in range(2))
-        self.extra = separable(neck, neck, 3, 2)
+        self.trunk = Trunk()
+        self.lateral = nn.ModuleList(conv(c, neck) for c in self.trunk.channels)
+        self.up = nn.ModuleList(separable(2 * neck, neck, 5) for _ in range(2))
+        self.down = nn.ModuleList(separable(neck, neck, 5, 2) for _ in range(2))
+        self.fuse = nn.ModuleList(separable(2 * neck, neck, 5) for _ in range(2))
+        self.extra = separable(neck, neck, 5, 2)
         self.heads = nn.ModuleList(Head(neck, nc) for _ in STRIDES)
         self.nc = nc
 
     def levels(self, x: Tensor) -> list[Tensor]:
         """Raw maps per stride: [B, nc + 32, h, w] with scores still as logits."""
-        c8 = self.stage8(self.stem(x))
-        c16 = self.stage16(c8)
-        c32 = self.stage32(c16)
-        p8, p16, p32 = (m(c) for m, c in zip(self.lateral, (c8, c16, c32)))
+        p8, p16, p32 = (m(c) for m, c in zip(self.lateral, self.trunk(x)))
         t16 = self.up[0](torch.cat((p16, nn.functional.interpolate(p32, scale_factor=2.0)), 1))
         o8 = self.up[1](torch.cat((p8, nn.functional.interpolate(t16, scale_factor=2.0)), 1))
         o16 = self.fuse[0](torch.cat((t16, self.down[0](o8)), 1))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import torch
 
@@ -9,6 +11,7 @@ from train import data, metrics, synth
 from train.evaluate import starts
 from train.loss import assign, iou, losses
 from train.model import BINS, INPUT, EmberNano, cells, decode
+from train.trunk import Trunk
 
 
 def test_output_shape_and_cell_order() -> None:
@@ -20,6 +23,26 @@ def test_output_shape_and_cell_order() -> None:
         y = EmberNano().eval()(torch.zeros(1, 3, INPUT, INPUT))
     assert y.shape == (1, 3598, 2 + 4 * BINS)
     assert 0 <= float(y[..., :2].min()) and float(y[..., :2].max()) <= 1
+
+
+def test_the_trunk_sees_what_the_published_one_sees() -> None:
+    """With TensorFlow's padding (far side only) in the place of ours, a picture that lies further right
+    and down by what each stride shifts gives the same maps, away from the borders."""
+    ours = Trunk().eval()
+    ours.start_from_imagenet()
+    theirs = copy.deepcopy(ours)
+    for m in theirs.modules():
+        if isinstance(m, torch.nn.Conv2d) and m.stride == (2, 2):
+            near = (m.kernel_size[0] - 2) // 2
+            m.register_forward_pre_hook(lambda m, x, n=near: (torch.nn.functional.pad(x[0], (n, n + 1, n, n + 1)),))
+            m.padding = (0, 0)
+    picture = torch.rand(1, 3, 512, 512)
+    shifts = {8: 7, 16: 15, 32: 31}
+    for i, (stride, shift) in enumerate(shifts.items()):
+        a = ours(picture)[i]
+        b = theirs(torch.roll(picture, (shift, shift), (2, 3)))[i]
+        mid = slice(a.shape[2] // 2 - 1, a.shape[2] // 2 + 1)
+        assert torch.allclose(a[..., mid, mid], b[..., mid, mid], atol=1e-3 * float(a.abs().max())), stride
 
 
 def test_decode_of_certain_bins() -> None:
