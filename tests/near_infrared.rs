@@ -186,7 +186,11 @@ fn a_near_infrared_eye_tells_of_each_of_two_fires_by_itself() {
     assert!(trends[0] < -0.03 && trends[1] > 0.03, "{trends:?}");
     let spectral_lost =
         |alarm: &AlarmProperties| alarm.degraded.iter().any(|r| r.starts_with("spectral"));
-    assert!(!flown.told.values().any(spectral_lost), "{:?}", flown.told);
+    assert!(
+        !flown.told.values().any(spectral_lost),
+        "{counters:?} {:?}",
+        flown.told
+    );
 }
 
 #[test]

@@ -2,7 +2,7 @@
 //! squares below the pixel.
 
 use super::error::{Factors, Matched};
-use super::refine::{Refined, Refiner};
+use super::refine::{LEAST_ALONG, Refined, Refiner};
 use super::scene::{Mask, Run, Scene};
 use super::search::{Curve, Peak, correlate};
 use super::{Disparity, Miss, RangeConfig, Refusal};
@@ -42,7 +42,7 @@ pub(super) fn find(scene: &Scene<'_>, config: &RangeConfig) -> Result<Matched, M
     let right = scene.opposite(peak.at)?;
     let weights = scene.weights(RIM_PX);
     let refined = Refiner::new(&scene.left, &right, &weights, -peak.at)
-        .and_then(|refiner| refiner.refine())
+        .and_then(|refiner| refiner.refine(LEAST_ALONG))
         .ok_or(Refusal::Inconsistent)?;
     Ok(Matched {
         found: disparity(&scene.flame, &refined.found),

@@ -23,6 +23,9 @@ const OUTLINE_PX: usize = 3;
 const LEAST_LIKENESS: f64 = 0.25;
 /// Pixels that are compared, at most.
 const MOST_PIXELS: usize = 1600;
+/// Least share of the target whose parts go with the whole: edges that one spectrum shows and the other does
+/// not are no sign of something in front.
+const LEAST_ALONG_SPECTRA: f64 = 0.1;
 
 /// How its error follows from what it saw; equal bits are few even between alike eyes.
 const FACTORS: Factors = Factors {
@@ -42,7 +45,7 @@ pub(super) fn find(scene: &Scene<'_>, config: &RangeConfig) -> Result<Matched, M
     let (left, right) = (gradient(&scene.left), gradient(&*scene.opposite(best.at)?));
     let weights = scene.weights(OUTLINE_PX);
     let refined = Refiner::new(&left, &right, &weights, -best.at)
-        .and_then(|refiner| refiner.refine())
+        .and_then(|refiner| refiner.refine(LEAST_ALONG_SPECTRA))
         .ok_or(Refusal::Inconsistent)?;
     Ok(Matched {
         found: disparity(&scene.flame, &refined.found),

@@ -111,12 +111,12 @@ impl Refiner {
         })
     }
 
-    /// The disparity of all pixels as one, then of its parts; `None` when it runs away, or when too little of
-    /// the target goes with it.
-    pub fn refine(&self) -> Option<Refinement> {
+    /// The disparity of all pixels as one, then of its parts; `None` when it runs away, or when less than a
+    /// share of the target goes with it.
+    pub fn refine(&self, least_along: f64) -> Option<Refinement> {
         let whole = self.together()?;
         let parts = self.parts(&whole);
-        if ((parts.len() * PART * PART) as f64) < LEAST_ALONG * self.counted() {
+        if ((parts.len() * PART * PART) as f64) < least_along * self.counted() {
             return None;
         }
         let found = pooled(&parts).unwrap_or(Refined {
@@ -404,7 +404,7 @@ const LEAST_FILLED: f64 = 0.2;
 const PART_REACH: f64 = 1.0;
 /// Least share of the target whose parts go with the whole: where fewer do, what was matched is in front of
 /// the target, or not in both eyes.
-const LEAST_ALONG: f64 = 0.25;
+pub(super) const LEAST_ALONG: f64 = 0.25;
 /// Parts that know no more than this count for nothing.
 const WORST_PART: f64 = 1.0;
 /// Fewer parts than this have no scatter to speak of.
@@ -684,7 +684,7 @@ mod tests {
                 *value = 0.7 * *value + 20.0;
             }
             let refiner = Refiner::new(&wave(0.0), &right, &weights(), 6).unwrap();
-            let found = refiner.refine().unwrap().found;
+            let found = refiner.refine(LEAST_ALONG).unwrap().found;
             assert!(
                 (found.disparity_px - truth).abs() < 0.01,
                 "{found:?} {truth}"
@@ -700,7 +700,7 @@ mod tests {
             ..wave(0.0)
         };
         let refiner = Refiner::new(&flat, &flat, &weights(), 5).unwrap();
-        assert_eq!(refiner.refine(), None);
+        assert_eq!(refiner.refine(LEAST_ALONG), None);
     }
 
     #[test]
