@@ -12,6 +12,7 @@
 mod chips;
 mod counters;
 mod feature;
+mod ground;
 mod light;
 mod selfcheck;
 mod vision;
@@ -24,14 +25,14 @@ pub use vision::{Seen, Vision};
 use crate::alarm::{Action, Alarm, AlarmDesk, Area, FireId, Situation};
 use crate::assess::extent::{Extent, Wind};
 use crate::assess::watch::{Assessment, Assessor, Light};
-use crate::detect::{Detection, Detector, GroundScale};
+use crate::detect::{Detection, Detector};
 use crate::ingest::StereoPair;
-use crate::locate::{Ground, SharedPriors, Terrain, TerrainHit, View, fix, meet_terrain};
+use crate::locate::{Ground, SharedPriors, Terrain, View, fix};
 use crate::mission::Mission;
 use crate::pose::{Pose, PoseAnswer, PoseEstimator};
 use crate::range::Ranger;
 use crate::track::{Classified, Estimated, Fire, Outcome, Tracker};
-use emberfix_calib::{Eye, RawPixel, RectifiedPixel, Rig};
+use emberfix_calib::Rig;
 use emberfix_frames::{
     Coordinate, GeoidUndulation, Metres, MissionEnu, ServiceTime, SignedDuration, Stamped,
     TimeSyncSample, Vector3, Wgs84, Wgs84Parts, ecef_from_enu, place_from_ecef, seconds,
@@ -412,7 +413,7 @@ impl Pipeline {
         let view = View::new(&rig, pose, &self.shared, &self.datum);
         let ground = self
             .bounded
-            .then(|| ground_scale(&view, self.terrain.as_deref()));
+            .then(|| ground::scale(&view, self.terrain.as_deref()));
         let looked = self.vision.look(pair, ground.flatten(), &mut self.counters);
         let Some(seen) = looked else {
             self.blind = Some("the latest pair could not be looked at".to_owned());
@@ -490,7 +491,7 @@ impl Pipeline {
         self.counters.add("self_check", "compared");
         let terrain = self.terrain.as_deref();
         self.check
-            .note(compared, |pixel| promised(pixel, view, terrain));
+            .note(compared, |pixel| ground::disparity_px(pixel, view, terrain));
     }
 
     /// A disparity of a rig that is not what its file says tells less.
@@ -664,36 +665,6 @@ impl AutopilotLock {
         self.system == Some(sender.system)
             && sender.component == emberfix_mav::ComponentId::AUTOPILOT
     }
-}
-
-/// Disparity of the ground behind a pixel of the rectified left image.
-fn promised(pixel: RectifiedPixel, view: &View<'_>, terrain: Option<&dyn Terrain>) -> Option<f64> {
-    let depth_m = ground_depth_m(pixel, view, terrain?)?;
-    Some(view.rig.disparity_px(depth_m))
-}
-
-/// Depth along the boresight of the ground behind a pixel of the rectified left image, metres.
-fn ground_depth_m(pixel: RectifiedPixel, view: &View<'_>, terrain: &dyn Terrain) -> Option<f64> {
-    let ray = view.ray_enu(pixel);
-    match meet_terrain(&view.camera_enu, &ray, terrain, view) {
-        TerrainHit::Met { range_m, .. } => {
-            let depth_m = view.enu_from_cam.column(2).dot(&ray) * range_m;
-            (depth_m > 0.0).then_some(depth_m)
-        }
-        _ => None,
-    }
-}
-
-/// How large things on the ground appear over the raw left image.
-fn ground_scale(view: &View<'_>, terrain: Option<&dyn Terrain>) -> Option<GroundScale> {
-    let terrain = terrain?;
-    let camera = view.rig.camera(Eye::Left);
-    let rectification = view.rig.rectification();
-    Some(GroundScale::sampled(camera.image_size_px, |u, v| {
-        let raw = [RawPixel { u, v }];
-        let pixel = *rectification.rectify(Eye::Left, &raw).ok()?.first()?;
-        Some(camera.focal_px.0 / ground_depth_m(pixel, view, terrain)?)
-    }))
 }
 
 /// Ellipsoid height minus altitude, where a receiver gives both.

@@ -137,6 +137,12 @@ fn simulated_figures(outcomes: &[Outcome]) -> Vec<Figure> {
             Bound::AtMost(0.3),
             of(Taken::InStep).count(),
         ),
+        Figure::told(
+            "calibration.snapshots_range_bias_10m",
+            rms_percent(Taken::Snapshots),
+            "%",
+            of(Taken::Snapshots).count(),
+        ),
     ];
     for taken in Taken::BOTH {
         let count = of(taken).count();
@@ -148,7 +154,6 @@ fn simulated_figures(outcomes: &[Outcome]) -> Vec<Figure> {
                 count,
             )
         };
-        figures.push(told("range_bias_10m", rms_percent(taken), "%"));
         figures.push(told("range_bias_10m_worst", worst_percent(taken), "%"));
         figures.push(told("range_bias_within_2_sigma", covered(taken), ""));
     }
