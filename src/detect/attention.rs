@@ -76,6 +76,40 @@ impl GroundScale {
     }
 }
 
+/// Which views of an image were looked at: of the places in the others a frame says nothing.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Looked {
+    views: Vec<(View, bool)>,
+}
+
+impl Looked {
+    /// These of all views; nothing to remember where it was all of them.
+    pub(super) fn at(views: &[View], chosen: &[usize]) -> Self {
+        if chosen.len() == views.len() {
+            return Self::default();
+        }
+        let looked = |(index, view): (usize, &View)| (*view, chosen.contains(&index));
+        Self {
+            views: views.iter().enumerate().map(looked).collect(),
+        }
+    }
+
+    /// Whether a thing of this many raw pixels would have been noticed at a place (column, row): it
+    /// was looked at as finely as it ever is, or finely enough for one so large.
+    #[must_use]
+    pub fn would_show(&self, (column, row): (f64, f64), size_px: f64) -> bool {
+        let finest = |only_looked: bool| {
+            let here = self.views.iter().filter(|(view, looked)| {
+                let (across, down) = view.extent();
+                (*looked || !only_looked) && across.contains(&column) && down.contains(&row)
+            });
+            here.map(|(view, _)| view.scale()).fold(0.0, f64::max)
+        };
+        let looked = finest(true);
+        looked >= finest(false) || looked * size_px >= SEEN_PX
+    }
+}
+
 /// What each view has waited for.
 #[derive(Debug, Default)]
 pub(super) struct Attention {
@@ -196,6 +230,21 @@ mod tests {
         let frames = (0..30).map(|_| attention.choose(&views, None, Some(3)));
         let seen = frames.filter(|chosen| chosen.contains(&9)).count();
         assert!(seen >= 8, "{seen}");
+    }
+
+    #[test]
+    fn what_no_tile_showed_is_not_missed_but_what_the_whole_frame_shows_is() {
+        let views = plan((1280, 720), INPUT, Some(416), 96);
+        // The whole frame at 0.325 and the tile in the upper left corner.
+        let looked = Looked::at(&views, &[0, 1]);
+        let (near, far) = ((100.0, 100.0), (1200.0, 700.0));
+        assert!(looked.would_show(near, 12.0));
+        assert!(!looked.would_show(far, 12.0), "4 px in the whole frame");
+        assert!(looked.would_show(far, 40.0), "13 px in the whole frame");
+        let all: Vec<usize> = (0..views.len()).collect();
+        assert!(Looked::at(&views, &all).would_show(far, 12.0));
+        let whole = plan((1280, 720), INPUT, None, 0);
+        assert!(Looked::at(&whole, &[0]).would_show(far, 2.0), "never finer");
     }
 
     #[test]

@@ -34,7 +34,7 @@ mod onnx;
 mod preprocess;
 mod runtime;
 
-pub use attention::GroundScale;
+pub use attention::{GroundScale, Looked};
 pub use boxfile::{BoxFileDetector, BoxFileError, GivenBox};
 pub use config::{ClassPolicy, DetectorConfig, ModelForm, YoloxOutput};
 pub use error::ModelError;
@@ -132,6 +132,11 @@ pub trait Detector: Send {
     /// # Errors
     /// [`DetectError`] when the frame's result can't be trusted; the next frame may be fine.
     fn detect(&mut self, image: &LeftImage) -> Result<Vec<Detection>, DetectError>;
+
+    /// Where the latest image was looked at; everywhere, unless a detector says otherwise.
+    fn looked(&self) -> Looked {
+        Looked::default()
+    }
 }
 
 /// Loads the model that a mission names.

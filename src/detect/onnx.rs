@@ -1,6 +1,6 @@
 //! A detector that runs an ONNX model.
 
-use super::attention::Attention;
+use super::attention::{Attention, Looked};
 use super::family::{Head, HeadProblem, ModelShape, Output};
 use super::metadata::Metadata;
 use super::model_file;
@@ -109,6 +109,7 @@ struct Plan {
     size: (u32, u32),
     views: Vec<View>,
     attention: Attention,
+    looked: Looked,
 }
 
 /// Looks by which a model's speed is known.
@@ -198,6 +199,7 @@ impl OnnxDetector {
                 size,
                 attention: Attention::new(views.len()),
                 views,
+                looked: Looked::default(),
             };
         }
         let Plan {
@@ -205,7 +207,9 @@ impl OnnxDetector {
         } = &mut self.plan;
         let most = self.info.views_per_frame;
         let mut candidates = Vec::new();
-        for index in attention.choose(views, image.ground.as_ref(), most) {
+        let chosen = attention.choose(views, image.ground.as_ref(), most);
+        self.plan.looked = Looked::at(&self.plan.views, &chosen);
+        for index in chosen {
             let found = self.look(bgr, index)?;
             self.plan.attention.note(index, !found.is_empty());
             candidates.extend(found);
@@ -330,6 +334,10 @@ impl Detector for OnnxDetector {
             });
         }
         self.detect_in(image)
+    }
+
+    fn looked(&self) -> Looked {
+        self.plan.looked.clone()
     }
 }
 
@@ -497,9 +505,11 @@ mod tests {
         assert_eq!(detector.info().views_per_frame, Some(1));
         detector.detect(&grey(1280, 720)).unwrap();
         assert_eq!(detector.spent().views, 1);
+        assert!(!detector.looked().would_show((640.0, 360.0), 20.0));
         let mut detector = bounded(None).unwrap();
         detector.detect(&grey(1280, 720)).unwrap();
         assert_eq!(detector.spent().views, 9);
+        assert!(detector.looked().would_show((640.0, 360.0), 20.0));
     }
 
     #[test]

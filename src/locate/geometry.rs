@@ -24,6 +24,18 @@ impl<F: Fn(f64) -> Option<Pose>> Motion for F {
     }
 }
 
+/// Where this moment's image was really looked at.
+pub trait Scrutiny {
+    /// Whether a thing of this many pixels (its longer side, raw) would have been noticed there.
+    fn would_show(&self, pixel: RectifiedPixel, size_px: f64) -> bool;
+}
+
+impl<F: Fn(RectifiedPixel, f64) -> bool> Scrutiny for F {
+    fn would_show(&self, pixel: RectifiedPixel, size_px: f64) -> bool {
+        self(pixel, size_px)
+    }
+}
+
 /// One camera at one moment, in the plane at the mission datum: everything as it was reported.
 #[derive(Clone)]
 pub struct View<'a> {
@@ -40,6 +52,7 @@ pub struct View<'a> {
     mission_from_ecef: RigidBodyTransform<Ecef, MissionEnu>,
     up: Vector3<f64>,
     motion: Option<&'a dyn Motion>,
+    scrutiny: Option<&'a dyn Scrutiny>,
     reported: Lens,
 }
 
@@ -71,6 +84,7 @@ impl<'a> View<'a> {
             mission_from_ecef,
             up,
             motion: None,
+            scrutiny: None,
             reported,
         }
     }
@@ -80,6 +94,21 @@ impl<'a> View<'a> {
     pub fn with_motion(mut self, motion: &'a dyn Motion) -> Self {
         self.motion = Some(motion);
         self
+    }
+
+    /// The same view, knowing which parts of the image were passed over.
+    #[must_use]
+    pub fn with_scrutiny(mut self, scrutiny: &'a dyn Scrutiny) -> Self {
+        self.scrutiny = Some(scrutiny);
+        self
+    }
+
+    /// Whether a thing of this many pixels would have been noticed there; all would, until
+    /// [`View::with_scrutiny`] knows better.
+    #[must_use]
+    pub fn would_show(&self, pixel: RectifiedPixel, size_px: f64) -> bool {
+        self.scrutiny
+            .is_none_or(|scrutiny| scrutiny.would_show(pixel, size_px))
     }
 
     /// What is known beforehand of the shared errors.

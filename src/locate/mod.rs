@@ -14,7 +14,7 @@ mod shared;
 mod shot;
 mod terrain;
 
-pub use geometry::{Motion, View, range_beneath};
+pub use geometry::{Motion, Scrutiny, View, range_beneath};
 pub use lens::{Distant, Lens, Linear, Predicted};
 pub use shared::{CONSTANT, SHARED, Shared, SharedPriors, WANDERING};
 pub use shot::Shot;

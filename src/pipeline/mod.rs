@@ -25,14 +25,14 @@ pub use vision::{Seen, Vision};
 use crate::alarm::{Action, Alarm, AlarmDesk, Area, FireId, Situation};
 use crate::assess::extent::{Extent, Wind};
 use crate::assess::watch::{Assessment, Assessor, Light};
-use crate::detect::{Detection, Detector};
+use crate::detect::{Detection, Detector, Looked};
 use crate::ingest::StereoPair;
 use crate::locate::{Ground, SharedPriors, Terrain, View, fix};
 use crate::mission::Mission;
 use crate::pose::{Pose, PoseAnswer, PoseEstimator};
 use crate::range::Ranger;
 use crate::track::{Classified, Estimated, Fire, Outcome, Tracker};
-use emberfix_calib::Rig;
+use emberfix_calib::{Eye, RectifiedPixel, Rig};
 use emberfix_frames::{
     Coordinate, GeoidUndulation, Metres, MissionEnu, ServiceTime, SignedDuration, Stamped,
     TimeSyncSample, Vector3, Wgs84, Wgs84Parts, ecef_from_enu, place_from_ecef, seconds,
@@ -431,7 +431,7 @@ impl Pipeline {
             .iter()
             .map(|(_, sighting)| self.widened(*sighting))
             .collect();
-        let outcomes = self.track(&view, &sightings);
+        let outcomes = self.track(&view, &sightings, &seen.looked);
         if self.tracker.scatter().is_large() {
             self.degraded.push("sightings_scatter");
         }
@@ -514,13 +514,23 @@ impl Pipeline {
     }
 
     /// The tracker may ask where the vehicle was at other moments: the clock error is one of its states.
-    fn track(&mut self, view: &View<'_>, sightings: &[Classified]) -> Vec<Outcome> {
+    fn track(
+        &mut self,
+        view: &View<'_>,
+        sightings: &[Classified],
+        looked: &Looked,
+    ) -> Vec<Outcome> {
         let (now, poses) = (self.now, &self.poses);
         let motion = |later_s: f64| match poses.at(view.pose.at + seconds(later_s), now) {
             PoseAnswer::Fresh(pose) => Some(*pose),
             _ => None,
         };
-        let view = view.clone().with_motion(&motion);
+        let rectification = self.rig.rectification();
+        let would_show = |pixel: RectifiedPixel, size_px: f64| {
+            let raw = rectification.unrectify(Eye::Left, pixel);
+            looked.would_show((raw.u, raw.v), size_px)
+        };
+        let view = view.clone().with_motion(&motion).with_scrutiny(&would_show);
         self.tracker.step(&view, sightings, self.terrain.as_deref())
     }
 

@@ -3,7 +3,7 @@
 use super::{Counters, light};
 use crate::alarm::AlarmClass;
 use crate::assess::PLAIN_LEVEL;
-use crate::detect::{BoxPx, Detection, DetectionClass, Detector, GroundScale, LeftImage};
+use crate::detect::{BoxPx, Detection, DetectionClass, Detector, GroundScale, LeftImage, Looked};
 use crate::ingest::{EncodedImage, EyeHealth, EyeWatch, ImageDecoder, StereoPair};
 use crate::locate::{DisparityOf, Sighting};
 use crate::range::{Disparity, EyeComparer, EyesCompared, Ranger, Ranging, RawPair, Target};
@@ -32,6 +32,8 @@ pub struct Seen {
     pub eyes: Option<EyesCompared>,
     /// The left image, raw.
     pub left_bgr: Mat,
+    /// Where it was looked at.
+    pub looked: Looked,
 }
 
 /// Decoder, detector and ranger of one rig.
@@ -124,6 +126,7 @@ impl Vision {
             sightings,
             mono: raw.right_gray.is_none(),
             left_bgr: raw.left_bgr,
+            looked: self.detector.looked(),
         })
     }
 

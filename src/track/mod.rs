@@ -50,6 +50,7 @@ pub use shared_errors::{Estimated, SharedErrors};
 
 use crate::alarm::{AlarmClass, FireId, FireState, Method, SizeM};
 use crate::locate::{Shared, Sighting, Terrain, View, fix};
+use emberfix_calib::RectifiedPixel;
 use emberfix_frames::{Coordinate, Covariance, Metres, MissionEnu, ServiceTime, Vector3};
 use estimate::Frame;
 use glimpse::Glimpse;
@@ -562,14 +563,20 @@ fn note_extent(fire: &mut Fire, sighting: &Sighting, view: &View<'_>) {
     }
 }
 
-/// In the image with a margin, and hardly further than it has been seen from.
+/// In a part of the image that was looked at, with a margin, and hardly further than it has been seen from.
 fn should_be_seen(fire: &Fire, glimpse: &Glimpse, view: &View<'_>) -> bool {
     let (width, height) = view.rig.camera(emberfix_calib::Eye::Left).image_size_px;
     let inside = |value: f64, size: u32| {
         let margin = 0.08 * f64::from(size);
         (margin..f64::from(size) - margin).contains(&value)
     };
-    inside(glimpse.seen.x, width)
+    let pixel = RectifiedPixel {
+        u: glimpse.seen.x,
+        v: glimpse.seen.y,
+    };
+    let side_m = fire.size_m.map_or(0.0, |size| size.width.max(size.height));
+    view.would_show(pixel, side_m * glimpse.px_per_m)
+        && inside(glimpse.seen.x, width)
         && inside(glimpse.seen.y, height)
         && (fire.estimate.position_m() - view.camera_enu).norm() <= MISS_REACH * fire.furthest_m
 }

@@ -293,6 +293,30 @@ fn a_fire_that_is_gone_ends_and_a_single_flash_is_forgotten() {
     assert!(flash.fires().is_empty());
 }
 
+/// Looks that passed a fire's place over say nothing of it, however many they are.
+#[test]
+fn what_was_not_looked_at_is_not_missed() {
+    let last_state = |looked_there: bool| {
+        let mut flight = Flight::new(Path::StraightIn, 3);
+        let mut tracker = Tracker::new(TrackConfig::default(), FireId(1));
+        for i in 0..45 {
+            let mut truth = flight.true_pose(0.0);
+            truth.at = truth.at + SignedDuration::from_millis(330 * i);
+            let seen = flight.sight(&truth).filter(|_| i < 10);
+            let mut reported = flight.reported(0.0);
+            reported.at = truth.at;
+            let datum = datum();
+            let would_show = |_: RectifiedPixel, _: f64| looked_there;
+            let view =
+                View::new(&flight.rig, &reported, &PRIORS, &datum).with_scrutiny(&would_show);
+            tracker.step(&view, seen.as_slice(), None);
+        }
+        tracker.fires()[0].state
+    };
+    assert_eq!(last_state(true), FireState::Out);
+    assert_eq!(last_state(false), FireState::Confirmed);
+}
+
 /// 16 px off, where a box's edge is known to 2 px and the attitude of a frame to 0.002 rad or 1.8 px: six
 /// sigmas. Given to the only fire there is, it must hardly move it, and begin no other.
 #[test]
