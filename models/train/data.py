@@ -269,6 +269,8 @@ class Mixer:
         if self.visible and rng.random() < 0.2:
             lamps(rng, c.image)
         img = photometric(rng, c.image)
+        if not self.visible and rng.random() < 0.5:  # white is hot: what a camera without a palette gives
+            img = cv2.cvtColor(cv2.cvtColor(img, cv2.COLOR_BGR2GRAY), cv2.COLOR_GRAY2BGR)
         boxes = np.array(c.boxes, np.float32).reshape(-1, 5)
         valid = c.valid
         if rng.random() < 0.5:

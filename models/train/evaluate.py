@@ -161,6 +161,7 @@ def main() -> None:
     ap.add_argument("--pick", action="store_true", help="choose thresholds here (on val, never on test)")
     ap.add_argument("--limit", type=float, default=2.0, help="false boxes per 100 negatives allowed by --pick")
     ap.add_argument("--threshold", type=float, help="instead of the one in the file")
+    ap.add_argument("--grey", action="store_true", help="pictures without their palette, as a thermal camera gives them")
     ap.add_argument("--sheet", type=Path, help="write a PNG of detections")
     args = ap.parse_args()
     cv2.setNumThreads(1)
@@ -173,6 +174,9 @@ def main() -> None:
         pictures += data.read_split(args.data, args.split, sets)
     if args.drawn:
         pictures += data.draw(args.drawn, 20_000)
+    if args.grey:
+        for p in pictures:
+            p.image = cv2.cvtColor(cv2.cvtColor(p.image, cv2.COLOR_BGR2GRAY), cv2.COLOR_GRAY2BGR)
     found = [detector.fitted(p.image) for p in pictures]
     for folder in args.frames:
         frames = data.read_yolo(folder)
@@ -188,9 +192,10 @@ def main() -> None:
     found = [f if ok else metrics.Found(f.boxes[f.cls == 0], f.score[f.cls == 0], f.cls[f.cls == 0])
              for f, ok in zip(found, labelled)]
     if args.pick:
-        values = [pick(found, truth, 0, args.limit), pick(smoke_found, smoke_truth, 1, args.limit)]
-        print(f"threshold fire {values[0]:.2f}, smoke {values[1]:.2f}")
-        threshold = values[0]
+        threshold = pick(found, truth, 0, args.limit)
+        print(f"threshold fire {threshold:.2f}")
+        if len(detector.names) > 1:
+            print(f"threshold smoke {pick(smoke_found, smoke_truth, 1, args.limit):.2f}")
     print(f"pictures {len(pictures)}, fire boxes {sum(int((t[:, 0] == 0).sum()) for t in truth)}, threshold {threshold:.2f}")
     print(f"fire AP50 {metrics.average_precision(*metrics.match(found, truth, 0)):.3f}")
     scale = [INPUT / max(p.image.shape[:2]) if max(p.image.shape[:2]) <= 2 * INPUT else 1.0 for p in pictures]
