@@ -184,6 +184,8 @@ struct RawSigma {
     tilt_deg: f64,
     gnss_constant_share: f64,
     gnss_correlation_s: f64,
+    velocity_m_s: f64,
+    velocity_correlation_s: f64,
     heading_constant_share: f64,
     heading_correlation_s: f64,
     tilt_constant_share: f64,
@@ -201,6 +203,8 @@ impl Default for RawSigma {
             tilt_deg: shared.tilt_rad.to_degrees(),
             gnss_constant_share: shared.gnss_constant_share,
             gnss_correlation_s: shared.gnss_correlation_s,
+            velocity_m_s: shared.velocity_m_s,
+            velocity_correlation_s: shared.velocity_correlation_s,
             heading_constant_share: shared.heading_constant_share,
             heading_correlation_s: shared.heading_correlation_s,
             tilt_constant_share: shared.tilt_constant_share,
@@ -283,6 +287,8 @@ const KNOWN: &[&str] = &[
     "sigma.tilt_deg",
     "sigma.gnss_constant_share",
     "sigma.gnss_correlation_s",
+    "sigma.velocity_m_s",
+    "sigma.velocity_correlation_s",
     "sigma.heading_constant_share",
     "sigma.heading_correlation_s",
     "sigma.tilt_constant_share",
@@ -477,6 +483,9 @@ fn check_sigma(checks: &mut Checks, sigma: &RawSigma) {
     ] {
         checks.range(key, seconds, 1.0, 1e6, "");
     }
+    checks.range("sigma.velocity_m_s", sigma.velocity_m_s, 0.01, 10.0, "");
+    let correlation_s = sigma.velocity_correlation_s;
+    checks.range("sigma.velocity_correlation_s", correlation_s, 0.01, 1e4, "");
 }
 
 fn build(raw: RawMission, path: &Path) -> Result<Mission, MissionError> {
@@ -537,6 +546,8 @@ fn build(raw: RawMission, path: &Path) -> Result<Mission, MissionError> {
         shared: SharedPriors {
             gnss_constant_share: raw.sigma.gnss_constant_share,
             gnss_correlation_s: raw.sigma.gnss_correlation_s,
+            velocity_m_s: raw.sigma.velocity_m_s,
+            velocity_correlation_s: raw.sigma.velocity_correlation_s,
             heading_rad: raw.sigma.heading_deg.to_radians(),
             heading_constant_share: raw.sigma.heading_constant_share,
             heading_correlation_s: raw.sigma.heading_correlation_s,

@@ -30,6 +30,8 @@ pub enum Mark {
     Dots,
     /// A line with a dot at each point.
     LineAndDots,
+    /// A line from each first to each second of two points: intervals.
+    Spans,
 }
 
 impl Series {
@@ -53,6 +55,8 @@ pub struct Axis {
     pub log: bool,
     /// Limits; from the points when there are none.
     pub limits: Option<(f64, f64)>,
+    /// What stands at 0, -1, -2 and so on, in place of numbers: on a vertical axis from the top down.
+    pub names: Vec<String>,
 }
 
 impl Axis {
@@ -63,6 +67,17 @@ impl Axis {
             label: label.into(),
             log: false,
             limits: None,
+            names: Vec::new(),
+        }
+    }
+
+    /// A vertical axis of names, the first at 0 on top, the next at -1, and so on.
+    #[must_use]
+    pub fn named(names: Vec<String>) -> Self {
+        let lowest = 0.5 - names.len().max(1) as f64;
+        Self {
+            names,
+            ..Self::linear("").within(lowest, 0.5)
         }
     }
 
@@ -106,6 +121,24 @@ impl Axis {
         }
         let air = ((high - low) * 0.05).max(high.abs() * 1e-3).max(1e-9);
         low - air..high + air
+    }
+
+    /// What stands at a tick.
+    fn tick(&self, value: f64) -> String {
+        if self.names.is_empty() {
+            return short(value);
+        }
+        let named = |(index, _): &(usize, &String)| (value + *index as f64).abs() < 0.01;
+        let mut names = self.names.iter().enumerate();
+        names
+            .find(named)
+            .map_or_else(String::new, |(_, name)| name.clone())
+    }
+
+    /// Room for what stands at its ticks, pixels.
+    fn room_px(&self) -> u32 {
+        let longest = self.names.iter().map(|name| name.chars().count()).max();
+        longest.map_or(NUMBERS_PX, |letters| letters as u32 * LETTER_PX + 16)
     }
 
     /// How far along the axis a value is, 0 to 1.
@@ -161,6 +194,11 @@ pub enum PlotError {
 
 const WIDTH_PX: u32 = 720;
 const HEIGHT_PX: u32 = 460;
+/// Room for the numbers beside a vertical axis and its label, and for one letter of a name.
+const NUMBERS_PX: u32 = 64;
+const LETTER_PX: u32 = 7;
+/// Ticks at most, where they are numbers.
+const TICKS: usize = 10;
 /// Distinct also for colour-blind readers (Okabe and Ito), darkest first.
 const COLOURS: [RGBColor; 9] = [
     RGBColor(0, 114, 178),
@@ -278,15 +316,16 @@ impl Chart {
             .caption(&self.title, ("sans-serif", 20))
             .margin(12)
             .x_label_area_size(44)
-            .y_label_area_size(64)
+            .y_label_area_size(self.y.room_px())
             .build_cartesian_2d(x, y)
             .map_err(failed)?;
         chart
             .configure_mesh()
             .x_desc(&self.x.label)
             .y_desc(&self.y.label)
-            .x_label_formatter(&|value| short(*value))
-            .y_label_formatter(&|value| short(*value))
+            .y_labels(self.y.names.len().max(TICKS))
+            .x_label_formatter(&|value| self.x.tick(*value))
+            .y_label_formatter(&|value| self.y.tick(*value))
             .light_line_style(TRANSPARENT)
             .label_style(("sans-serif", 14))
             .draw()
@@ -336,6 +375,12 @@ impl Chart {
         if series.mark == Mark::Dashed {
             let dashes = DashedLineSeries::new(shown.clone(), 8, 5, style);
             legend = Some(chart.draw_series(dashes).map_err(failed)?);
+        }
+        if series.mark == Mark::Spans {
+            let spans = shown
+                .chunks_exact(2)
+                .map(|ends| PathElement::new(ends.to_vec(), style.stroke_width(4)));
+            legend = Some(chart.draw_series(spans).map_err(failed)?);
         }
         if matches!(series.mark, Mark::Dots | Mark::LineAndDots) {
             let dots = shown
@@ -512,6 +557,28 @@ mod tests {
             pixels.pixels().iter().filter(|p| p.red() < 100).count()
         };
         assert!(dark(&chart()) > dark(&without) + 100);
+    }
+
+    #[test]
+    fn each_name_of_an_axis_stands_at_its_tick() {
+        let names: Vec<String> = (0..16).map(|index| format!("name {index}.")).collect();
+        let rows = (0..16).map(|index| (1.0, -f64::from(index))).collect();
+        let chart = Chart::new("rows", Axis::linear("x"), Axis::named(names.clone()))
+            .with(Series::new("dots", Mark::Dots, rows));
+        let svg = chart.svg().unwrap();
+        let heights: Vec<f64> = names.iter().map(|name| height_of(&svg, name)).collect();
+        assert!(
+            heights.windows(2).all(|pair| pair[0] < pair[1]),
+            "{heights:?}"
+        );
+    }
+
+    /// Where a text stands, pixels from the top.
+    fn height_of(svg: &str, text: &str) -> f64 {
+        let ends = svg.find(text).unwrap();
+        let element = &svg[svg[..ends].rfind("<text").unwrap()..ends];
+        let value = element.split(" y=\"").nth(1).unwrap();
+        value.split('"').next().unwrap().parse().unwrap()
     }
 
     #[test]

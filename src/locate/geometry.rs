@@ -129,6 +129,13 @@ impl<'a> View<'a> {
         &self.up
     }
 
+    /// Body origin as reported, mission plane, metres.
+    #[must_use]
+    pub fn body_enu(&self) -> Vector3<f64> {
+        let body = Coordinate::<Ecef>::from_wgs84(&self.pose.place);
+        self.mission_from_ecef.transform(body).metres()
+    }
+
     /// A point of the mission plane on the Earth; `None` when it is nowhere near its surface.
     #[must_use]
     pub fn place(&self, point: &Coordinate<MissionEnu>) -> Option<Wgs84> {

@@ -17,7 +17,7 @@ mod terrain;
 pub use geometry::{Motion, Scrutiny, View, range_beneath};
 pub use lens::{Distant, Lens, Linear, Predicted};
 pub use shared::{CONSTANT, SHARED, Shared, SharedPriors, WANDERING};
-pub use shot::Shot;
+pub use shot::{GNSS, Shot};
 pub use terrain::{
     Area, ConstantPlane, Coverage, Ground, Terrain, TerrainHit, Tile, TileError, TileParts,
     TileSigmas, Tiles, VerticalDatum, meet_terrain,

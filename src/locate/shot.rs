@@ -54,6 +54,8 @@ const REACH_S: (f64, f64) = (0.02, 0.9);
 const MOMENT_S: f64 = 0.15;
 /// Moments that one is interpolated from.
 const NODES: usize = 4;
+/// What makes up the receiver's error.
+pub const GNSS: [Shared; 3] = [Shared::GnssConstant, Shared::Gnss, Shared::GnssNoise];
 
 impl Shot {
     /// Keeps what `station_at` says of the moments where the shutter may have opened: the reported
@@ -217,8 +219,7 @@ impl Corrected {
             * station.enu_from_body
             * Rotation3::new(-body).matrix();
         let arm = enu_from_body * (optics.lever_arm_m - three(Shared::LeverArm));
-        let gnss =
-            three(Shared::GnssConstant) + three(Shared::Gnss) + three(Shared::PositionJitter);
+        let gnss = GNSS.map(three).iter().sum::<Vector3<f64>>() + three(Shared::PositionJitter);
         Self {
             enu_from_body,
             enu_from_cam: enu_from_body * optics.body_from_cam,
@@ -253,7 +254,7 @@ impl Corrected {
             let moved = turn.column(index).cross(&self.arm);
             centre.set_column(index, &moved);
         }
-        for from in [Shared::GnssConstant, Shared::Gnss, Shared::PositionJitter] {
+        for from in GNSS.into_iter().chain([Shared::PositionJitter]) {
             centre
                 .fixed_view_mut::<3, 3>(0, from as usize)
                 .copy_from(&-Matrix3::identity());

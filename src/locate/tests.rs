@@ -8,6 +8,8 @@ use std::f64::consts::FRAC_PI_2;
 pub(super) const SIGMAS: SharedPriors = SharedPriors {
     gnss_constant_share: 0.5,
     gnss_correlation_s: 100.0,
+    velocity_m_s: 0.1,
+    velocity_correlation_s: 1.0,
     heading_rad: 0.03,
     heading_constant_share: 0.5,
     heading_correlation_s: 100.0,

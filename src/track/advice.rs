@@ -18,7 +18,7 @@ use crate::locate::{Shared, View};
 use emberfix_frames::{Covariance, Matrix3, MissionEnu, Vector3};
 use nalgebra::{SMatrix, SVector};
 
-/// Numbers of the covariance that advice rests on: the fire's east, north, up (m); then what must be
+/// Numbers of the covariance that advice rests on: where the fire is, east, north, up (m); then what must be
 /// added to the truth to get what is reported: GNSS east, north, up (m), heading (rad clockwise),
 /// turns of the camera about the body axes (rad), disparity (px), clock (s).
 pub const ADVISED: usize = 12;
@@ -148,13 +148,14 @@ impl Outlook<'_> {
         let metres_per_px = range * range / self.look.focal_baseline_px_m;
         if metres_per_px * self.look.disparity_px < STEREO_REACH * range {
             let mut row: Row = displaced.tr_mul(&ahead);
-            row[DISPARITY] = metres_per_px;
+            row[DISPARITY] = -metres_per_px;
             rows.push((row, (metres_per_px * self.look.disparity_px).powi(2)));
         }
         Some(rows)
     }
 
-    /// Where the fire would be placed against where it is believed, over all numbers, metres.
+    /// Where a look would place the fire, over all numbers, metres: where it truly is and, with that,
+    /// what each error adds.
     fn displacement(
         &self,
         sight: &Vector3<f64>,
@@ -164,7 +165,7 @@ impl Outlook<'_> {
     ) -> SMatrix<f64, 3, ADVISED> {
         let mut by = SMatrix::<f64, 3, ADVISED>::zeros();
         by.fixed_view_mut::<3, 3>(0, 0)
-            .copy_from(&-Matrix3::<f64>::identity());
+            .copy_from(&Matrix3::identity());
         by.fixed_view_mut::<3, 3>(0, GNSS)
             .copy_from(&Matrix3::identity());
         let down = -Vector3::z();
@@ -263,12 +264,13 @@ mod tests {
             0.005,
         ]);
         let mut prior = SMatrix::from_diagonal(&sigmas.component_mul(&sigmas));
-        // The receiver's error moves the fire with it.
+        // Looks have placed the fire where it is and the receiver's error together: what the one has
+        // more, the other has less.
         for axis in 0..3 {
             let gnss = prior[(GNSS + axis, GNSS + axis)];
             prior[(axis, axis)] += gnss;
-            prior[(axis, GNSS + axis)] = gnss;
-            prior[(GNSS + axis, axis)] = gnss;
+            prior[(axis, GNSS + axis)] = -gnss;
+            prior[(GNSS + axis, axis)] = -gnss;
         }
         prior
     }

@@ -7,7 +7,7 @@
 //! they were linearised, and each better length would seem to say something of GNSS that no sighting
 //! does.
 
-use crate::locate::{Distant, Lens, Linear, SHARED, Shared};
+use crate::locate::{Distant, GNSS, Lens, Linear, SHARED, Shared};
 use emberfix_frames::{Matrix3, Vector3};
 use nalgebra::{SMatrix, SVector};
 
@@ -115,7 +115,7 @@ impl Chart {
     /// the image with that; if each report counted as flown, each look would say that the fire is
     /// far away (errors in variables; the remedy is regression calibration).
     #[must_use]
-    pub fn flown_share(&self, way: &Vector3<f64>, variances: &[f64; 3]) -> f64 {
+    pub fn flown_share(&self, way: &Vector3<f64>, variances: &Vector3<f64>) -> f64 {
         let ray = self.axes.column(2);
         let across = way - ray * ray.dot(way);
         let variance: f64 = (0..3)
@@ -137,5 +137,5 @@ fn without_gnss(lens: &Lens, errors: &SVector<f64, SHARED>) -> Vector3<f64> {
         let by = lens.centre_by_shared().fixed_columns::<3>(from as usize);
         by * errors.fixed_rows::<3>(from as usize)
     };
-    lens.centre() - moved(Shared::GnssConstant) - moved(Shared::Gnss)
+    lens.centre() - GNSS.map(moved).iter().sum::<Vector3<f64>>()
 }

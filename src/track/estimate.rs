@@ -4,10 +4,11 @@ use super::chart::{Chart, INVERSE_DEPTH, OF_FIRE, State, TANGENTS};
 use super::ground::LocalGround;
 use super::joint::{JOINT, Joint, JointVector, Known, LASTING, Measured, Pace, Scatter};
 use super::look::{Look, new_in_frame, rows};
+use super::odometer::{Flown, Reading};
 use super::window::{About, CLOCK, Kept, Window};
 use crate::alarm::Method;
 use crate::locate::{Fix, Lens, Predicted, SHARED, Shot, Sighting, Terrain, View};
-use emberfix_frames::{Covariance, Matrix3, MissionEnu, ServiceTime, Vector3};
+use emberfix_frames::{Covariance, Matrix3, MissionEnu, Vector3};
 use nalgebra::{Matrix2, SMatrix};
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -20,14 +21,16 @@ pub struct Estimate {
     /// Apart from the rest, which every frame looks at: thousands of fires stay close in memory.
     joint: Box<Joint>,
     /// When the errors in `joint` are those.
-    at: ServiceTime,
+    at: Reading,
     position_m: Vector3<f64>,
     covariance: Matrix3<f64>,
     methods: BTreeSet<Method>,
     first_sight: Vector3<f64>,
-    first_at: ServiceTime,
+    first: Reading,
     /// The camera at the first look, as reported.
     first_camera: Vector3<f64>,
+    /// What of the reported way since then was surely flown.
+    flown: Flown,
     /// Looks since it was last solved, and looks that it was solved from.
     unsolved: usize,
     solved: usize,
@@ -46,6 +49,8 @@ pub struct Frame<'a> {
     pub lens: &'a Lens,
     /// The errors that the lens was made with.
     pub known: &'a Known,
+    /// The odometer.
+    pub reading: &'a Reading,
     /// How errors change.
     pub pace: &'a Pace,
     /// How much more noise there is than was said.
@@ -95,7 +100,7 @@ impl Estimate {
         let place = fix.map_or(&frame.view.pose.place, |fix| &fix.place);
         let terrain_sigma_m = frame.terrain.map_or(0.0, |terrain| terrain.sigma_m(place));
         let joint = Joint::unseen(frame.known, frame.lens, inverse_depth, terrain_sigma_m);
-        let now = frame.view.pose.at;
+        let now = *frame.reading;
         let mut estimate = Self {
             chart: Chart::along(frame.lens, &frame.known.all(), &ray),
             window: Window::new(joint.clone(), now),
@@ -106,8 +111,9 @@ impl Estimate {
             covariance: Matrix3::zeros(),
             methods: BTreeSet::new(),
             first_sight: ray,
-            first_at: sighting.at,
+            first: now,
             first_camera: frame.view.camera_enu,
+            flown: Flown::default(),
             unsolved: 0,
             solved: 0,
         };
@@ -168,10 +174,18 @@ impl Estimate {
         lens.predict(&point)
     }
 
-    /// Lets the errors change up to now.
-    pub fn age(&mut self, now: ServiceTime, pace: &Pace) {
-        self.joint.age((now - self.at).as_secs_f64(), pace);
-        self.at = now;
+    /// Lets the errors change, and the camera move on, up to a frame.
+    pub fn age(&mut self, frame: &Frame<'_>) {
+        self.joint.age(&self.at, frame.reading, frame.pace);
+        self.at = *frame.reading;
+        let since_s = (frame.reading.at - self.first.at).as_secs_f64();
+        let by_itself = frame.pace.receiver_variances(since_s);
+        let (strayed_m, variances) = frame.reading.strayed_since(&self.first, &by_itself);
+        let way = frame.view.camera_enu - self.first_camera - strayed_m;
+        self.flown = Flown {
+            strayed_m,
+            share: self.chart.flown_share(&way, &variances),
+        };
     }
 
     /// Where it should be seen by what it knows of the errors itself, as of now.
@@ -180,7 +194,7 @@ impl Estimate {
         let state = self.joint.fire();
         let (point, _, _) = self.chart.distant(&state);
         let linear = frame.lens.linear(&point)?;
-        let way = self.chart.way(frame.lens, &frame.known.all());
+        let way = self.chart.way(frame.lens, &frame.known.all()) - self.flown.strayed_m;
         let by_state = self.chart.slopes(&linear, &state, frame.lens, &way);
         let rows = rows(&by_state, &linear.by_shared);
         let apart = self.joint.mean() - self.point(frame);
@@ -249,7 +263,7 @@ impl Estimate {
     fn solve_about(&mut self, at: &JointVector, frame: &Frame<'_>, ground: Option<&LocalGround>) {
         let about = About {
             at,
-            when: self.at,
+            when: &self.at,
             clock_sigma: self.joint.sigma(CLOCK),
             scatter: frame.scatter,
         };
@@ -284,24 +298,17 @@ impl Estimate {
             sighting,
             lens: frame.lens,
             up: frame.view.up(),
-            flown_share: self.flown_share(frame),
+            flown: &self.flown,
         };
         look.measure(&self.chart, at)
-    }
-
-    fn flown_share(&self, frame: &Frame<'_>) -> f64 {
-        let view = frame.view;
-        let since_s = (view.pose.at - self.first_at).as_secs_f64();
-        let variances = view.priors().way_variances(view.sigmas(), since_s);
-        let way = view.camera_enu - self.first_camera;
-        self.chart.flown_share(&way, &variances)
     }
 
     fn keep(&mut self, sighting: &Sighting, frame: &Frame<'_>) {
         let kept = Kept {
             shot: Arc::clone(frame.shot),
             sighting: *sighting,
-            flown_share: self.flown_share(frame),
+            reading: *frame.reading,
+            flown: self.flown,
         };
         self.window.add(kept);
         if self.window.is_over() {
@@ -322,7 +329,7 @@ impl Estimate {
         let ground = self.ground(frame, &at, &horizontal(&self.covariance));
         let about = About {
             at: &at,
-            when: self.at,
+            when: &self.at,
             clock_sigma: self.joint.sigma(CLOCK),
             scatter: frame.scatter,
         };

@@ -50,7 +50,7 @@ pub fn all(fires: &mut [Fire], frame: &Frame<'_>) -> Vec<Glimpse> {
     for (slot, fire) in fires.iter_mut().enumerate().filter(|(_, f)| f.is_open()) {
         let predicted = fire.estimate.predict(frame.lens).filter(is_near);
         let Some(predicted) = predicted else { continue };
-        fire.estimate.age(frame.view.pose.at, frame.pace);
+        fire.estimate.age(frame);
         if let Some(seen) = fire.estimate.seen(frame) {
             glimpses.push(Glimpse {
                 slot,

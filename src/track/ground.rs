@@ -49,7 +49,8 @@ impl LocalGround {
 
     /// The ground about `point` within the horizontal error `covariance`: a plane through what the
     /// model says at the ends of the ellipse's axes, and what the model strays from that plane.
-    /// `None` where the model says nothing.
+    /// `None` where the model says nothing at one of these places: to take a void for level ground would
+    /// make the position surer than anybody is.
     #[must_use]
     pub fn about(
         point: &Vector3<f64>,
@@ -71,9 +72,7 @@ impl LocalGround {
                 let there = point + Vector3::new(step[0], step[1], 0.0);
                 height_of_ground(&there, view, terrain)
             };
-            let (Some(ahead), Some(behind)) = (at(1.0), at(-1.0)) else {
-                continue;
-            };
+            let (ahead, behind) = (at(1.0)?, at(-1.0)?);
             slope += along * ((ahead - behind) / (2.0 * reach));
             // As for the clock: what a parabola strays from its line, at sqrt(3) sigma.
             stray += ((ahead + behind) * 0.5 - middle).powi(2) / 3.0;
@@ -92,4 +91,44 @@ fn height_of_ground(point: &Vector3<f64>, view: &View<'_>, terrain: &dyn Terrain
     let place = view.place(&Coordinate::<MissionEnu>::from_metres(*point))?;
     let ground = terrain.height_at(&place)?;
     Some(ground.m() - place.height().m())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::locate::SharedPriors;
+    use crate::testing::{datum, pose, rig};
+    use emberfix_frames::{EllipsoidHeight, Wgs84, Wgs84Parts};
+
+    /// Ground that rises by a half to the east, and is a void east of the datum by more than this.
+    struct Slope {
+        void_from_m: f64,
+    }
+
+    impl Terrain for Slope {
+        fn height_at(&self, place: &Wgs84) -> Option<EllipsoidHeight> {
+            let metres_per_deg = 111_320.0 * datum().latitude_deg().to_radians().cos();
+            let east_m = (place.longitude_deg() - datum().longitude_deg()) * metres_per_deg;
+            (east_m <= self.void_from_m).then(|| EllipsoidHeight::from_m(0.5 * east_m))
+        }
+        fn sigma_m(&self, _place: &Wgs84) -> f64 {
+            1.0
+        }
+    }
+
+    #[test]
+    fn beside_a_void_nothing_is_known_of_the_slope() {
+        let (rig, pose, datum) = (rig(30.0), pose(0.0, 0.0, 0.0), datum());
+        let view = View::new(&rig, &pose, &SharedPriors::default(), &datum);
+        let about = |void_from_m: f64| {
+            let point = Vector3::new(0.0, 30.0, -20.0);
+            let ellipse = Matrix2::new(100.0, 0.0, 0.0, 4.0);
+            LocalGround::about(&point, &ellipse, &view, &Slope { void_from_m })
+        };
+        let whole = about(f64::INFINITY).unwrap();
+        assert!((whole.slope.0 - 0.5).abs() < 1e-2, "{whole:?}");
+        // The ellipse reaches 17 m to the east.
+        assert!(about(20.0).is_some());
+        assert_eq!(about(10.0), None);
+    }
 }

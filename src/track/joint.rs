@@ -5,8 +5,9 @@
 //! in flight needs no bookkeeping). Errors that are new in each frame are noise of its sightings.
 
 use super::chart::{INVERSE_DEPTH, OF_FIRE, State, TANGENTS};
-use crate::locate::{CONSTANT, Lens, SHARED, SharedPriors, WANDERING};
-use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
+use super::odometer::Reading;
+use crate::locate::{CONSTANT, Lens, SHARED, Shared, SharedPriors, WANDERING};
+use nalgebra::{Matrix2, Matrix3, SMatrix, SVector, Vector2, Vector3};
 
 /// Shared errors that last beyond a frame.
 pub const LASTING: usize = CONSTANT + WANDERING;
@@ -29,6 +30,8 @@ pub struct Pace {
     correlations_s: [f64; WANDERING],
     /// Variance per second, prior variances.
     drifts: [f64; CONSTANT],
+    /// Sigmas of the receiver's error that wanders, and of that which is new in each report, metres.
+    gnss_m: [Vector3<f64>; 2],
 }
 
 /// What some seconds do to the shared errors.
@@ -36,6 +39,19 @@ pub struct Pace {
 struct Passed {
     keeps: [f64; WANDERING],
     drifted: [f64; CONSTANT],
+    receiver: [Strayed; 3],
+}
+
+/// How the receiver's error changed along one axis, as the velocity tells it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Strayed {
+    /// Sigmas of what wanders and of what is new in each report, metres.
+    sigmas_m: Vector2<f64>,
+    /// What is left of each.
+    keeps: Vector2<f64>,
+    /// By how much the error changed, metres, and the variance of that, m².
+    by_m: f64,
+    variance_m2: f64,
 }
 
 impl Pace {
@@ -46,24 +62,58 @@ impl Pace {
         Self {
             correlations_s: priors.correlations_s(),
             drifts: std::array::from_fn(|i| drift(i).min(1.0) / 60.0),
+            gnss_m: [Shared::Gnss, Shared::GnssNoise]
+                .map(|from| sigmas.fixed_rows::<3>(from as usize).into_owned()),
         }
     }
 
     /// What is left of each wandering error after some seconds.
     #[must_use]
     pub fn keeps(&self, dt_s: f64) -> [f64; WANDERING] {
-        self.correlations_s
-            .map(|correlation_s| (-dt_s.abs() / correlation_s).exp())
+        let correlations_s = &self.correlations_s;
+        let mut keeps = [1.0; WANDERING];
+        if dt_s == 0.0 {
+            return keeps;
+        }
+        for i in 0..WANDERING {
+            // Axes of one error are alike, and an exponential is dear.
+            let is_alike = i > 0 && correlations_s[i] == correlations_s[i - 1];
+            keeps[i] = if is_alike {
+                keeps[i - 1]
+            } else {
+                (-dt_s.abs() / correlations_s[i]).exp()
+            };
+        }
+        keeps
     }
 
-    fn passed(&self, dt_s: f64) -> Passed {
-        let dt_s = dt_s.max(0.0);
+    /// Variances of how much the receiver's error changes in some seconds, by itself: m².
+    #[must_use]
+    pub fn receiver_variances(&self, dt_s: f64) -> Vector3<f64> {
+        let [wanders, new] = self.gnss_m.map(|sigmas| sigmas.component_mul(&sigmas));
+        let keep = (-dt_s.abs() / self.correlations_s[0]).exp();
+        wanders * (2.0 * (1.0 - keep)) + new * 2.0
+    }
+
+    fn passed(&self, from: &Reading, to: &Reading) -> Passed {
+        let dt_s = (to.at - from.at).as_secs_f64().max(0.0);
+        let keeps = self.keeps(dt_s);
+        let by_m = to.strayed_m - from.strayed_m;
         Passed {
-            keeps: self.keeps(dt_s),
+            keeps,
             drifted: self.drifts.map(|drift| drift * dt_s),
+            receiver: std::array::from_fn(|axis| Strayed {
+                sigmas_m: Vector2::from_fn(|i, _| self.gnss_m[i][axis]),
+                keeps: Vector2::new(keeps[axis], keeps[NEW + axis]),
+                by_m: by_m[axis],
+                variance_m2: to.variance_m2 - from.variance_m2,
+            }),
         }
     }
 }
+
+/// Index of the receiver's error that is new in each report, among what wanders.
+const NEW: usize = Shared::GnssNoise as usize - CONSTANT;
 
 /// Lets the shared errors, which stand from index `from` on, change.
 fn age<const N: usize>(
@@ -75,12 +125,103 @@ fn age<const N: usize>(
     for (i, drifted) in passed.drifted.iter().enumerate() {
         covariance[(from + i, from + i)] += drifted;
     }
-    for (i, keep) in passed.keeps.iter().enumerate() {
+    for (i, keep) in passed.keeps.iter().enumerate().take(NEW).skip(3) {
         let at = from + CONSTANT + i;
         mean[at] *= keep;
         covariance.row_mut(at).scale_mut(*keep);
         covariance.column_mut(at).scale_mut(*keep);
         covariance[(at, at)] += 1.0 - keep * keep;
+    }
+    stray(mean, covariance, from + CONSTANT, &passed.receiver);
+}
+
+/// Lets the receiver's error change; what wanders of it stands from index `from` on, what is new in each
+/// report [`NEW`] further.
+///
+/// Along an axis, with `x` those two numbers, `s` their sigmas, `x' = A x + w` and `w` of variance `Q`, the
+/// velocity says `d = s' (x' - x) + n = a' x + s' w + n` with `a = (A - 1) s`. That is news of `x` first;
+/// then `w = k (d - a' x)` with `k = Q s / (s' Q s + r)`, and what is left of it varies by `Q - k s' Q`.
+fn stray<const N: usize>(
+    mean: &mut SVector<f64, N>,
+    covariance: &mut SMatrix<f64, N, N>,
+    from: usize,
+    receiver: &[Strayed; 3],
+) {
+    let before = receiver.map(|axis| axis.sigmas_m.component_mul(&axis.keeps.add_scalar(-1.0)));
+    let of_two =
+        |v: &SVector<f64, N>, axis: usize| Vector2::new(v[from + axis], v[from + axis + NEW]);
+    let levers = [0, 1, 2].map(|axis| {
+        let (wanders, new) = (from + axis, from + axis + NEW);
+        covariance.column(wanders) * before[axis][0] + covariance.column(new) * before[axis][1]
+    });
+    let seen = |i: usize, j: usize| before[i].dot(&of_two(&levers[j], i));
+    let spread =
+        Matrix3::from_fn(|i, j| seen(i, j) + if i == j { receiver[i].variance() } else { 0.0 });
+    // Where no time has passed, nothing has changed.
+    let whitener = spread
+        .cholesky()
+        .and_then(|factor| factor.l().try_inverse());
+    let Some(whitener) = whitener else { return };
+    let left = Vector3::from_fn(|i, _| receiver[i].by_m - before[i].dot(&of_two(mean, i)));
+    let whitened = SMatrix::from_columns(&levers) * whitener.transpose();
+    *mean += whitened * (whitener * left);
+    subtract_squared(covariance, &whitened);
+    for (axis, strayed) in receiver.iter().enumerate() {
+        let at = [from + axis, from + axis + NEW];
+        strayed.go_on(mean, covariance, at, &before[axis]);
+    }
+}
+
+impl Strayed {
+    /// Of what is new by chance, metres times prior sigmas.
+    fn fresh(&self) -> (Vector2<f64>, Vector2<f64>) {
+        let fresh = self.keeps.map(|keep| 1.0 - keep * keep);
+        (fresh, self.sigmas_m.component_mul(&fresh))
+    }
+
+    /// Variance of what the velocity says of the change, for the part that is new, m².
+    fn variance(&self) -> f64 {
+        self.fresh().1.dot(&self.sigmas_m) + self.variance_m2
+    }
+
+    /// The second step of [`stray`], for the numbers at two indices.
+    fn go_on<const N: usize>(
+        &self,
+        mean: &mut SVector<f64, N>,
+        covariance: &mut SMatrix<f64, N, N>,
+        at: [usize; 2],
+        before: &Vector2<f64>,
+    ) {
+        let (fresh, spread) = self.fresh();
+        let gain = spread / self.variance();
+        let moves = Matrix2::from_diagonal(&self.keeps) - gain * before.transpose();
+        let of_two = |v: &SVector<f64, N>| Vector2::new(v[at[0]], v[at[1]]);
+        let moved = moves * of_two(mean) + gain * self.by_m;
+        let columns = at.map(|i| covariance.column(i).into_owned());
+        let own = Matrix2::from_columns(&[of_two(&columns[0]), of_two(&columns[1])]);
+        let own = moves * own * moves.transpose() + Matrix2::from_diagonal(&fresh)
+            - gain * spread.transpose();
+        for (k, i) in at.into_iter().enumerate() {
+            mean[i] = moved[k];
+            let column = columns[0] * moves[(k, 0)] + columns[1] * moves[(k, 1)];
+            covariance.set_column(i, &column);
+            covariance.set_row(i, &column.transpose());
+        }
+        for (k, i) in at.into_iter().enumerate() {
+            for (l, j) in at.into_iter().enumerate() {
+                covariance[(i, j)] = own[(k, l)];
+            }
+        }
+    }
+}
+
+/// `P - W W'` in one pass, in place: what a fire costs in a frame is mostly this.
+fn subtract_squared<const N: usize>(p: &mut SMatrix<f64, N, N>, w: &SMatrix<f64, N, 3>) {
+    for (j, mut column) in p.column_iter_mut().enumerate() {
+        let [a, b, c] = [0, 1, 2].map(|k| w[(j, k)]);
+        for i in 0..N {
+            column[i] -= w[(i, 0)] * a + w[(i, 1)] * b + w[(i, 2)] * c;
+        }
     }
 }
 
@@ -104,8 +245,9 @@ impl Default for Known {
 
 impl Known {
     /// Lets time pass.
-    pub fn age(&mut self, dt_s: f64, pace: &Pace) {
-        age(&mut self.mean, &mut self.covariance, 0, &pace.passed(dt_s));
+    pub fn age(&mut self, from: &Reading, to: &Reading, pace: &Pace) {
+        let passed = pace.passed(from, to);
+        age(&mut self.mean, &mut self.covariance, 0, &passed);
     }
 
     /// Best guess of all shared errors; those that are new in each frame are nothing.
@@ -270,8 +412,8 @@ impl Joint {
     }
 
     /// Lets time pass.
-    pub fn age(&mut self, dt_s: f64, pace: &Pace) {
-        let passed = pace.passed(dt_s);
+    pub fn age(&mut self, from: &Reading, to: &Reading, pace: &Pace) {
+        let passed = pace.passed(from, to);
         age(&mut self.mean, &mut self.covariance, OF_FIRE, &passed);
     }
 
@@ -302,7 +444,7 @@ impl Joint {
         let whitener = factor?.l().try_inverse()?;
         let whitened = lever * whitener.transpose();
         self.mean += whitened * (whitener * left);
-        self.covariance -= whitened * whitened.transpose();
+        subtract_squared(&mut self.covariance, &whitened);
         self.keep_positive();
         Some(squared / if m.has_disparity { 3.0 } else { 2.0 })
     }

@@ -2,6 +2,7 @@
 
 use super::chart::{ByState, Chart, OF_FIRE, State};
 use super::joint::{JOINT, JointVector, LASTING, Measured};
+use super::odometer::Flown;
 use crate::locate::{Distant, Lens, Linear, SHARED, Sighting, range_beneath};
 use emberfix_calib::RectifiedPixel;
 use emberfix_frames::{Matrix3, Vector3};
@@ -16,8 +17,8 @@ pub struct Look<'a> {
     pub lens: &'a Lens,
     /// Local vertical.
     pub up: &'a Vector3<f64>,
-    /// Share of the reported way since the first sighting that was surely flown.
-    pub flown_share: f64,
+    /// What of the reported way since the first sighting was surely flown.
+    pub flown: &'a Flown,
 }
 
 /// Row of the disparity.
@@ -38,7 +39,7 @@ impl Look<'_> {
             0.0,
         );
         let mut by_shared = seen.by_shared;
-        let way = chart.way(self.lens, &shared(at)) * self.flown_share;
+        let way = self.flown.of(&chart.way(self.lens, &shared(at)));
         let mut by_state = chart.slopes(&seen, &state, self.lens, &way);
         let flame = self.flame(&base);
         if let Some((px, linear)) = &flame {

@@ -36,6 +36,7 @@ mod ground;
 mod joint;
 mod life;
 mod look;
+mod odometer;
 mod pairs;
 mod shared_errors;
 mod window;
@@ -54,6 +55,7 @@ use emberfix_calib::RectifiedPixel;
 use emberfix_frames::{Coordinate, Covariance, Metres, MissionEnu, ServiceTime, Vector3};
 use estimate::Frame;
 use glimpse::Glimpse;
+use odometer::{Odometer, Reading};
 use pairs::Pairs;
 use std::sync::Arc;
 
@@ -174,7 +176,7 @@ pub struct Tracker {
     scatter: Scatter,
     shared: Option<SharedErrors>,
     pairs: Pairs,
-    last_step: Option<ServiceTime>,
+    odometer: Option<Odometer>,
 }
 
 /// Fires at most.
@@ -192,7 +194,8 @@ const CLOCK_SIGMAS: f64 = 1.75;
 const LOOK_AHEAD_S: f64 = 0.6;
 /// Looks that are solved again in a frame at most, but for the last fire's.
 const SOLVED_LOOKS: usize = 400;
-/// Every so many sightings a fire teaches what it has learned.
+/// Every so many sightings a fire teaches what it has learned; neighbours in turn, lest one frame pays
+/// for all.
 const TEACHES: u32 = 4;
 /// Sightings in a row that may stray from a fire before another one begins there.
 const STRAYS: u8 = 8;
@@ -211,7 +214,7 @@ impl Tracker {
             scatter: Scatter::default(),
             shared: None,
             pairs: Pairs::default(),
-            last_step: None,
+            odometer: None,
         }
     }
 
@@ -254,7 +257,7 @@ impl Tracker {
     ) -> Vec<Outcome> {
         let now = view.pose.at;
         let pace = Pace::new(view.priors(), view.sigmas());
-        self.age(now, &pace);
+        let reading = self.age(view, &pace);
         let known = self.known.clone();
         let clock = Shared::Clock as usize;
         let clock_sigma = known.covariance[(clock, clock)].max(0.0).sqrt();
@@ -264,6 +267,7 @@ impl Tracker {
             shot: &shot,
             lens: &shot.lens(&known.all(), clock_sigma),
             known: &known,
+            reading: &reading,
             pace: &pace,
             scatter: self.scatter,
             terrain,
@@ -295,12 +299,12 @@ impl Tracker {
     }
 
     /// Lets time pass since the last frame.
-    fn age(&mut self, now: ServiceTime, pace: &Pace) {
-        let since = self
-            .last_step
-            .map_or(0.0, |last| (now - last).as_secs_f64());
-        self.last_step = Some(now);
-        self.known.age(since, pace);
+    fn age(&mut self, view: &View<'_>, pace: &Pace) -> Reading {
+        let odometer = self.odometer.get_or_insert_with(|| Odometer::new(view));
+        let before = odometer.reading();
+        let reading = odometer.go_on(view);
+        self.known.age(&before, &reading, pace);
+        reading
     }
 
     /// Gives strays to their fires: a few in a row, and no more, lest a fire that is placed wrongly
@@ -341,8 +345,9 @@ impl Tracker {
     /// What the best known fire has learned of the shared errors is what the next one begins with.
     /// Which is best is told by how sure it is, not by what it says, so the choice bends nothing.
     fn learn(&mut self, seen: &[bool]) {
-        let teaches =
-            |fire: &Fire| fire.is_confirmed() && fire.evidence.hits().is_multiple_of(TEACHES);
+        let teaches = |fire: &Fire| {
+            fire.is_confirmed() && (fire.evidence.hits() + fire.id.0).is_multiple_of(TEACHES)
+        };
         let taught = self.fires.iter().zip(seen);
         let taught = taught.filter(|(fire, is_seen)| **is_seen && teaches(fire));
         let taught = taught.map(|(fire, _)| fire.estimate.joint().known());

@@ -13,8 +13,8 @@ use super::chart::{Chart, INVERSE_DEPTH, OF_FIRE, TANGENTS};
 use super::ground::LocalGround;
 use super::joint::{Joint, JointVector, Pace, Scatter};
 use super::look::{Look, shared};
+use super::odometer::{Flown, Reading};
 use crate::locate::{CONSTANT, Shared, Shot, Sighting, WANDERING};
-use emberfix_frames::ServiceTime;
 use std::sync::Arc;
 
 /// Looks that are kept.
@@ -35,15 +35,17 @@ pub struct Kept {
     pub shot: Arc<Shot>,
     /// What it showed.
     pub sighting: Sighting,
-    /// Share of the reported way since the first look that was surely flown.
-    pub flown_share: f64,
+    /// The odometer at that moment.
+    pub reading: Reading,
+    /// What of the reported way since the first look was surely flown.
+    pub flown: Flown,
 }
 
 /// The latest looks at a fire, and what was known before them.
 #[derive(Debug, Clone)]
 pub struct Window {
     before: Box<Joint>,
-    before_at: ServiceTime,
+    before_at: Reading,
     looks: Vec<Kept>,
     /// Whether `before` holds what the ground says.
     ground_is_folded: bool,
@@ -55,7 +57,7 @@ pub struct About<'a> {
     /// Fire and errors as believed.
     pub at: &'a JointVector,
     /// When the errors are those, which wander.
-    pub when: ServiceTime,
+    pub when: &'a Reading,
     /// One sigma of the clock error, in its prior sigmas.
     pub clock_sigma: f64,
     /// How much more noise there is than was said.
@@ -65,7 +67,7 @@ pub struct About<'a> {
 impl Window {
     /// No look yet.
     #[must_use]
-    pub fn new(before: Joint, before_at: ServiceTime) -> Self {
+    pub fn new(before: Joint, before_at: Reading) -> Self {
         Self {
             before: Box::new(before),
             before_at,
@@ -122,7 +124,7 @@ impl Window {
         about: &About<'_>,
         pace: &Pace,
         ground: Option<&LocalGround>,
-    ) -> (Joint, ServiceTime) {
+    ) -> (Joint, Reading) {
         let (mut joint, mut when) = self.pass(chart, about, pace, ground);
         let mut at = *about.at;
         for _ in 1..PASSES {
@@ -132,7 +134,7 @@ impl Window {
             at = Joint::clamped(*joint.mean(), at[INVERSE_DEPTH]);
             let next = About {
                 at: &at,
-                when,
+                when: &when,
                 clock_sigma: joint.sigma(CLOCK),
                 scatter: about.scatter,
             };
@@ -147,7 +149,7 @@ impl Window {
         about: &About<'_>,
         pace: &Pace,
         ground: Option<&LocalGround>,
-    ) -> (Joint, ServiceTime) {
+    ) -> (Joint, Reading) {
         let (mut joint, mut at) = (self.before.as_ref().clone(), self.before_at);
         if let Some(ground) = ground.filter(|_| !self.ground_is_folded) {
             ground.hold(&mut joint, chart, about.at);
@@ -161,21 +163,21 @@ impl Window {
 fn run(
     looks: &[Kept],
     joint: &mut Joint,
-    at: &mut ServiceTime,
+    at: &mut Reading,
     chart: &Chart,
     about: &About<'_>,
     pace: &Pace,
 ) {
     for look in looks {
-        joint.age((look.sighting.at - *at).as_secs_f64(), pace);
-        *at = look.sighting.at;
+        joint.age(at, &look.reading, pace);
+        *at = look.reading;
         let point = about.at_look(look, pace);
         let lens = look.shot.lens(&shared(&point), about.clock_sigma);
         let measured = Look {
             sighting: &look.sighting,
             lens: &lens,
             up: look.shot.up(),
-            flown_share: look.flown_share,
+            flown: &look.flown,
         }
         .measure(chart, &point);
         if let Some(mut measured) = measured {
@@ -190,7 +192,7 @@ impl About<'_> {
     /// now, a share of what it is now.
     fn at_look(&self, look: &Kept, pace: &Pace) -> JointVector {
         let mut point = *self.at;
-        let keeps = pace.keeps((self.when - look.sighting.at).as_secs_f64());
+        let keeps = pace.keeps((self.when.at - look.reading.at).as_secs_f64());
         for (i, keep) in (0..WANDERING).zip(keeps) {
             point[OF_FIRE + CONSTANT + i] *= keep;
         }

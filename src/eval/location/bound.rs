@@ -4,8 +4,9 @@
 //! looks, where the estimator goes look by look: the sightings' joint covariance holds the pixels'
 //! noise, the airframe's jitter and every wandering error between every two looks,
 //! `C = R + sum_n s_n^2 (a_n + (1 - a_n) exp(-|t_i - t_j| / tau_n)) g_in g_jn'`, and the information about the position
-//! is `J' C^-1 J` plus what the ground says. Sensitivities are central differences of the truth's own
-//! projection at the truth.
+//! is `J' C^-1 J` plus what the ground says. Of the receiver's errors `C` holds what the reported velocities
+//! leave of them ([`Receiver`]), since the estimator has those too. Sensitivities are central differences of
+//! the truth's own projection at the truth.
 
 use super::estimator::Ground;
 use super::truth::{ErrorModel, Flame, Lens, SLOW, Slow, TrueCamera, slow};
@@ -27,7 +28,7 @@ pub struct BoundLook {
 struct Sensitivity {
     by_position: SMatrix<f64, 3, 3>,
     by_slow: SMatrix<f64, 3, SLOW>,
-    by_jitter: SMatrix<f64, 3, 6>,
+    by_jitter: Matrix3<f64>,
 }
 
 /// Steps of the differences: far above rounding (1e-10 px), far below any curvature.
@@ -55,16 +56,20 @@ fn batch(lens: &Lens, errors: &ErrorModel, flames: &[(Flame, Vec<BoundLook>)]) -
     let mut jacobian = DMatrix::<f64>::zeros(count, 3 * flames.len());
     let variances = errors.sigmas().map(|sigma| sigma * sigma);
     let (shares, correlations) = (errors.constant_shares(), errors.correlations_s());
+    let receiver = Receiver::between(errors, rows.iter().map(|(_, look, _)| look.t_s).collect());
     for (i, (flame, look, by)) in rows.iter().enumerate() {
         jacobian
             .fixed_view_mut::<3, 3>(3 * i, 3 * flame)
             .copy_from(&by.by_position);
         for (j, (_, other, by_other)) in rows.iter().enumerate().take(i + 1) {
             let apart_s = (look.t_s - other.t_s).abs();
-            let common = Slow::from_fn(|n, _| {
+            let mut common = Slow::from_fn(|n, _| {
                 let wandered = (-apart_s / correlations[n]).exp();
                 variances[n] * (shares[n] + (1.0 - shares[n]) * wandered)
             });
+            common
+                .fixed_rows_mut::<3>(slow::GNSS)
+                .copy_from(&receiver.covariance(look.t_s, other.t_s));
             let mut block =
                 by.by_slow * SMatrix::from_diagonal(&common) * by_other.by_slow.transpose();
             if apart_s == 0.0 {
@@ -102,7 +107,8 @@ pub fn information(
 
 /// The yardstick for estimators that go look by look: one generalised least squares solution over
 /// all looks at once, by Gauss-Newton from the truth, with the covariance of its last step. What it
-/// leaves is what curvature alone costs. `looks` hold the airframe as reported; `seen` their columns,
+/// leaves is what curvature alone costs. `looks` hold the airframe as reported, less the receiver's most
+/// likely errors ([`Receiver::most_likely`]); `seen` their columns,
 /// rows and disparities (any number where there was none).
 #[must_use]
 pub fn all_at_once(
@@ -119,8 +125,7 @@ pub fn all_at_once(
         let batch = batch(lens, errors, &[(flame, looks.to_vec())])?;
         let mut left = DVector::<f64>::zeros(3 * seen.len());
         for (i, (look, seen)) in looks.iter().zip(seen).enumerate() {
-            let none = SMatrix::<f64, 6, 1>::zeros();
-            let predicted = numbers(lens, &look.state, &Slow::zeros(), &none, &flame)?;
+            let predicted = numbers(lens, &look.state, &Slow::zeros(), &Vector3::zeros(), &flame)?;
             left.fixed_rows_mut::<3>(3 * i)
                 .copy_from(&(seen - predicted));
         }
@@ -179,12 +184,99 @@ fn ground_information(ground: &Ground) -> Matrix3<f64> {
     normal * normal.transpose() / (ground.sigma_m * ground.sigma_m)
 }
 
-fn jitter(errors: &ErrorModel) -> SMatrix<f64, 6, 6> {
-    let mut variances = SMatrix::<f64, 6, 1>::repeat(errors.position_noise_m.powi(2));
-    variances
-        .fixed_rows_mut::<3>(3)
-        .fill(errors.attitude_noise_rad.powi(2));
-    SMatrix::from_diagonal(&variances)
+/// The receiver's errors at the times of some looks, as the reported velocities leave them.
+///
+/// Between two looks the reported position moves by the way and by what the error changes; the velocities,
+/// summed up by trapezoids, say the way but for what *they* err. So differences of the error are seen,
+/// `d = H e + n`, and the covariance of `e` is `C - C H' (H C H' + N)^-1 H C`, per axis.
+pub struct Receiver {
+    times_s: Vec<f64>,
+    /// East and north alike, then up: covariance, and what a change that was seen is weighed with.
+    axes: [(DMatrix<f64>, DMatrix<f64>); 2],
+}
+
+impl Receiver {
+    /// At times in any order.
+    #[must_use]
+    pub fn between(errors: &ErrorModel, mut times_s: Vec<f64>) -> Self {
+        times_s.sort_by(f64::total_cmp);
+        times_s.dedup();
+        let axes = [errors.gnss_horizontal_m, errors.gnss_vertical_m]
+            .map(|sigma_m| along_axis(errors, sigma_m, &times_s));
+        Self { times_s, axes }
+    }
+
+    /// Variances common to two of the times: east, north, up, m².
+    fn covariance(&self, one_s: f64, other_s: f64) -> Vector3<f64> {
+        let at = |t_s: f64| self.times_s.partition_point(|time| *time < t_s);
+        let [flat, up] = [0, 1].map(|axis| self.axes[axis].0[(at(one_s), at(other_s))]);
+        Vector3::new(flat, flat, up)
+    }
+
+    /// Most likely errors at each of the times, metres, given positions and velocities as reported.
+    #[must_use]
+    pub fn most_likely(&self, reported: &[(Vector3<f64>, Vector3<f64>)]) -> Vec<Vector3<f64>> {
+        let changes: Vec<Vector3<f64>> = reported
+            .windows(2)
+            .zip(self.times_s.windows(2))
+            .map(|(pair, times_s)| {
+                let way = (pair[0].1 + pair[1].1) * (0.5 * (times_s[1] - times_s[0]));
+                pair[1].0 - pair[0].0 - way
+            })
+            .collect();
+        let along = |axis: usize| {
+            let changes = DVector::from_iterator(changes.len(), changes.iter().map(|c| c[axis]));
+            &self.axes[axis / 2].1 * changes
+        };
+        let [east, north, up] = [0, 1, 2].map(along);
+        (0..reported.len())
+            .map(|i| Vector3::new(east[i], north[i], up[i]))
+            .collect()
+    }
+}
+
+fn along_axis(errors: &ErrorModel, sigma_m: f64, times_s: &[f64]) -> (DMatrix<f64>, DMatrix<f64>) {
+    let count = times_s.len();
+    let share = errors.gnss_constant_share;
+    let forgotten = |i: usize, j: usize, correlation_s: f64| {
+        (-(times_s[i] - times_s[j]).abs() / correlation_s).exp()
+    };
+    let error = DMatrix::from_fn(count, count, |i, j| {
+        let wanders = (1.0 - share) * forgotten(i, j, errors.gnss_correlation_s);
+        let new = if i == j {
+            errors.position_noise_m.powi(2)
+        } else {
+            0.0
+        };
+        sigma_m * sigma_m * (share + wanders) + new
+    });
+    let velocity = DMatrix::from_fn(count, count, |i, j| {
+        errors.velocity_m_s.powi(2) * forgotten(i, j, errors.velocity_correlation_s)
+    });
+    let steps = count.saturating_sub(1);
+    let differences = DMatrix::from_fn(steps, count, |i, j| match j.checked_sub(i) {
+        Some(0) => -1.0_f64,
+        Some(1) => 1.0,
+        _ => 0.0,
+    });
+    let trapezoids = DMatrix::from_fn(steps, count, |i, j| {
+        0.5 * (times_s[i + 1] - times_s[i]) * differences[(i, j)].abs()
+    });
+    let seen = &differences * &error;
+    let spread = &seen * differences.transpose() + &trapezoids * velocity * trapezoids.transpose();
+    let gain = spread
+        .cholesky()
+        .map_or_else(
+            || DMatrix::zeros(steps, count),
+            |factor| factor.solve(&seen),
+        )
+        .transpose();
+    (&error - &gain * &seen, gain)
+}
+
+/// Of the airframe's attitude; the position's is among the receiver's errors.
+fn jitter(errors: &ErrorModel) -> Matrix3<f64> {
+    Matrix3::identity() * errors.attitude_noise_rad.powi(2)
 }
 
 fn own_noise(errors: &ErrorModel, stereo: bool) -> Matrix3<f64> {
@@ -201,12 +293,12 @@ fn own_noise(errors: &ErrorModel, stereo: bool) -> Matrix3<f64> {
 }
 
 /// The airframe that truly is when the one that is reported errs by `slow` and jitters.
-fn erring(state: &BodyState, slow: &Slow, jitter: &SMatrix<f64, 6, 1>) -> BodyState {
+fn erring(state: &BodyState, slow: &Slow, jitter: &Vector3<f64>) -> BodyState {
     let gnss: Vector3<f64> = slow.fixed_rows::<3>(slow::GNSS).into_owned();
     let clock = slow[slow::CLOCK];
-    let moved = gnss + jitter.fixed_rows::<3>(0) + state.velocity_m_s * clock;
+    let moved = gnss + state.velocity_m_s * clock;
     let tilt = Vector3::new(slow[slow::TILT], slow[slow::TILT + 1], 0.0);
-    let turn = tilt + jitter.fixed_rows::<3>(3) + state.rate_rad_s * clock;
+    let turn = tilt + jitter + state.rate_rad_s * clock;
     let heading = Rotation3::from_axis_angle(&Vector3::z_axis(), slow[slow::HEADING]);
     BodyState {
         position_m: state.position_m - moved,
@@ -221,7 +313,7 @@ fn numbers(
     lens: &Lens,
     state: &BodyState,
     slow: &Slow,
-    jitter: &SMatrix<f64, 6, 1>,
+    jitter: &Vector3<f64>,
     flame: &Flame,
 ) -> Option<Vector3<f64>> {
     let state = erring(state, slow, jitter);
@@ -235,14 +327,14 @@ fn numbers(
 }
 
 fn sensitivity(lens: &Lens, look: &BoundLook, flame: &Flame) -> Option<Sensitivity> {
-    let none = SMatrix::<f64, 6, 1>::zeros();
+    let none = Vector3::zeros();
     let column = |plus: Option<Vector3<f64>>, minus: Option<Vector3<f64>>, step: f64| {
         Some((plus? - minus?) / (2.0 * step))
     };
     let mut by = Sensitivity {
         by_position: SMatrix::zeros(),
         by_slow: SMatrix::zeros(),
-        by_jitter: SMatrix::zeros(),
+        by_jitter: Matrix3::zeros(),
     };
     for axis in 0..3 {
         let at = |step: f64| {
@@ -266,15 +358,14 @@ fn sensitivity(lens: &Lens, look: &BoundLook, flame: &Flame) -> Option<Sensitivi
         by.by_slow
             .set_column(n, &column(at(step), at(-step), step)?);
     }
-    for n in 0..6 {
-        let step = if n < 3 { METRE_STEP } else { RADIAN_STEP };
+    for n in 0..3 {
         let at = |step: f64| {
             let mut jitter = none;
             jitter[n] = step;
             numbers(lens, &look.state, &Slow::zeros(), &jitter, flame)
         };
         by.by_jitter
-            .set_column(n, &column(at(step), at(-step), step)?);
+            .set_column(n, &column(at(RADIAN_STEP), at(-RADIAN_STEP), RADIAN_STEP)?);
     }
     Some(by)
 }

@@ -39,6 +39,9 @@ pub struct Cell {
     pub first: Option<Consistency>,
 }
 
+/// [`Cell::rmse_over_bound`] at most.
+pub const ALLOWED_OVER_BOUND: f64 = 1.15;
+
 /// All groups that have flights.
 #[must_use]
 pub fn cells(flown: &[Flown]) -> Vec<Cell> {

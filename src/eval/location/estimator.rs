@@ -235,6 +235,8 @@ fn priors(errors: &ErrorModel) -> SharedPriors {
     SharedPriors {
         gnss_constant_share: errors.gnss_constant_share,
         gnss_correlation_s: errors.gnss_correlation_s,
+        velocity_m_s: errors.velocity_m_s,
+        velocity_correlation_s: errors.velocity_correlation_s,
         heading_rad: errors.heading_deg.to_radians(),
         heading_constant_share: errors.heading_constant_share,
         heading_correlation_s: errors.heading_correlation_s,

@@ -34,6 +34,9 @@ pub enum Law {
     /// GNSS errors that stay and then jump to another value, as often as they would have forgotten
     /// the old one: the assumed correlation in time, by jumps of metres within a look.
     JumpingGnss,
+    /// Velocity errors that forget ten times slower than assumed: the way that is summed up from them
+    /// strays three times further.
+    SlowVelocity,
     /// All that wanders (GNSS, heading, tilt) is a sine of a period by chance, 20 to 120 s.
     SineDrift,
     /// Tails, sticky boxes, Laplace mounts and fast GNSS together.
@@ -42,7 +45,7 @@ pub enum Law {
 
 impl Law {
     /// Those that the estimator does not assume.
-    pub const FOREIGN: [Self; 10] = [
+    pub const FOREIGN: [Self; 11] = [
         Self::HeavyTails,
         Self::StickyBoxes,
         Self::UniformMount,
@@ -51,6 +54,7 @@ impl Law {
         Self::SlowGnss,
         Self::WalkingGnss,
         Self::JumpingGnss,
+        Self::SlowVelocity,
         Self::SineDrift,
         Self::Everything,
     ];
@@ -68,6 +72,7 @@ impl Law {
             Self::SlowGnss => "GNSS correlation time x 3",
             Self::WalkingGnss => "GNSS random walk, 0.1 sigma per root second",
             Self::JumpingGnss => "GNSS in jumps instead of a drift",
+            Self::SlowVelocity => "velocity correlation time x 10",
             Self::SineDrift => "sine drift of GNSS, heading, tilt, 20 to 120 s",
             Self::Everything => "t pixels, sticky boxes, Laplace, fast GNSS together",
         }
@@ -81,6 +86,9 @@ impl Law {
             _ => 1.0,
         };
         seconds.rows_mut(slow::GNSS, 3).scale_mut(factor);
+        if self == Self::SlowVelocity {
+            seconds.rows_mut(slow::VELOCITY, 3).scale_mut(10.0);
+        }
         seconds
     }
 

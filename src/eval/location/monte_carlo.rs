@@ -1,6 +1,6 @@
 //! Many flights with one fire each: error, promised error, bound.
 
-use super::bound::{BoundLook, all_at_once, bound};
+use super::bound::{BoundLook, Receiver, all_at_once, bound};
 use super::estimator::{Ground, Pilot, SetupError, ground_at_datum, on_ground};
 use super::flight::{Course, Kind, log_uniform};
 use super::law::{Draw, Law};
@@ -286,20 +286,31 @@ fn answer(
 }
 
 fn solve_at_once(errors: &ErrorModel, staged: &Staged<'_>) -> Option<Scored> {
+    let seeing = staged
+        .looks
+        .iter()
+        .filter_map(|look| Some((look, look.seen?)));
+    let seeing: Vec<_> = seeing
+        .map(|(look, seen)| (&look.truth, look.autopilot.report(0.0), seen))
+        .collect();
+    let times_s = seeing.iter().map(|(truth, ..)| truth.t_s).collect();
+    let moved: Vec<_> = seeing
+        .iter()
+        .map(|(_, reported, _)| (reported.position_m, reported.velocity_m_s))
+        .collect();
+    let strayed = Receiver::between(errors, times_s).most_likely(&moved);
     let (mut looks, mut numbers) = (Vec::new(), Vec::new());
-    for look in &staged.looks {
-        let Some(seen) = look.seen else { continue };
-        let reported = look.autopilot.report(0.0);
+    for ((truth, reported, seen), strayed_m) in seeing.into_iter().zip(strayed) {
         let state = BodyState {
             t_s: reported.t_s,
-            position_m: reported.position_m,
+            position_m: reported.position_m - strayed_m,
             enu_from_body: reported.enu_from_body,
             velocity_m_s: reported.velocity_m_s,
             rate_rad_s: reported.rate_rad_s,
         };
         looks.push(BoundLook {
             state,
-            ..look.truth
+            ..truth.clone()
         });
         let (u, v) = seen.base_px;
         numbers.push(Vector3::new(u, v, seen.disparity_px.unwrap_or(0.0)));

@@ -1,6 +1,6 @@
 //! Error and promised error against range; coverage; NEES; RMSE over bound.
 
-use super::cells::{Cell, LawRow, alarms, of_kind};
+use super::cells::{ALLOWED_OVER_BOUND, Cell, LawRow, alarms, of_kind};
 use super::flight::Kind;
 use super::monte_carlo::Flown;
 use super::score::{CHI2_2_90, Scored, mean};
@@ -113,37 +113,37 @@ fn coverage(flown: &[Flown], laws: &[LawRow]) -> Sheet {
         let points = points.into_iter().map(|(x, y)| (x, y * y)).collect();
         by_range = by_range.with(Series::new(gnss.name(), Mark::LineAndDots, points));
     }
-    let mut by_law = Chart::new(
-        "90 % ellipse under other laws (order of the table)",
-        Axis::linear("law"),
-        Axis::linear("held").within(0.6, 1.0),
-    )
-    .with(Series::new(
-        "honest",
-        Mark::Dashed,
-        vec![(0.0, 0.9), ((laws.len().max(2) - 1) as f64, 0.9)],
-    ));
-    let of_law = |value: fn(&LawRow) -> Option<f64>| {
-        let points = laws.iter().enumerate();
-        points
-            .filter_map(|(index, law)| Some((index as f64, value(law)?)))
-            .collect()
-    };
-    by_law = by_law
-        .with(Series::new(
-            "consumer",
-            Mark::Dots,
-            of_law(|law| law.consumer.map(|c| c.coverage90)),
-        ))
-        .with(Series::new(
-            "rtk",
-            Mark::Dots,
-            of_law(|law| law.rtk.map(|c| c.coverage90)),
-        ));
     Sheet {
-        charts: vec![promised, by_range, by_law],
+        charts: vec![promised, by_range, by_law(laws)],
         columns: 3,
     }
+}
+
+/// Dots at rows that have a value: the first on top.
+fn dots<T>(label: &str, rows: &[T], value: fn(&T) -> Option<f64>) -> Series {
+    let rows = rows.iter().enumerate();
+    let points = rows.filter_map(|(row, of)| Some((value(of)?, -(row as f64))));
+    Series::new(label, Mark::Dots, points.collect())
+}
+
+/// A dashed line down all rows.
+fn upright(label: &str, x: f64, rows: usize) -> Series {
+    let ends = vec![(x, 0.5), (x, 0.5 - rows as f64)];
+    Series::new(label, Mark::Dashed, ends)
+}
+
+fn by_law(laws: &[LawRow]) -> Chart {
+    let names = laws.iter().map(|law| law.errors.to_owned()).collect();
+    Chart::new(
+        "90 % ellipse under laws that are not assumed",
+        Axis::linear("held").within(0.7, 1.0),
+        Axis::named(names),
+    )
+    .with(upright("honest", 0.9, laws.len()))
+    .with(dots("consumer", laws, |law| {
+        law.consumer.map(|c| c.coverage90)
+    }))
+    .with(dots("rtk", laws, |law| law.rtk.map(|c| c.coverage90)))
 }
 
 fn nees(flown: &[Flown]) -> Sheet {
@@ -160,68 +160,59 @@ fn nees(flown: &[Flown]) -> Sheet {
             .map(|x| (x, (-0.5 * x).exp()))
             .collect(),
     ));
-    let mut mean_of = Chart::new(
-        "ANEES / 2 of observable flights and its 95 % interval",
-        Axis::linear("hover, straight-in, fly-by, orbit").within(-0.5, 3.5),
-        Axis::linear("ANEES / 2"),
-    );
-    let (mut values, mut ends) = (Vec::new(), (Vec::new(), Vec::new()));
-    for (index, kind) in Kind::ALL.into_iter().enumerate() {
+    for kind in Kind::ALL {
         let of = flown.iter().filter(|f| f.case.kind == kind && f.observable);
         let alarms: Vec<f64> = of.filter_map(|f| f.last).map(|l| l.nees).collect();
         let above = |limit: f64| mean(alarms.iter().map(|n| f64::from(u8::from(*n > limit))));
         let points = (0..=48).map(|i| f64::from(i) / 4.0).map(|x| (x, above(x)));
         spread = spread.with(Series::new(kind.name(), Mark::Line, points.collect()));
-        if let Some(all) = of_kind(flown, kind) {
-            values.push((index as f64, all.anees));
-            ends.0.push((index as f64, all.anees_95.0));
-            ends.1.push((index as f64, all.anees_95.1));
-        }
     }
-    mean_of = mean_of
-        .with(Series::new("95 % of honest runs", Mark::Dashed, ends.0))
-        .with(Series::new("", Mark::Dashed, ends.1))
-        .with(Series::new("measured", Mark::Dots, values));
     Sheet {
-        charts: vec![spread, mean_of],
+        charts: vec![spread, mean_nees(flown)],
         columns: 2,
     }
 }
 
+fn mean_nees(flown: &[Flown]) -> Chart {
+    let kinds = Kind::ALL.map(|kind| (kind, of_kind(flown, kind)));
+    let names = kinds.iter().map(|(kind, _)| kind.name().to_owned());
+    let honest = kinds.iter().enumerate().filter_map(|(row, (_, of))| {
+        let ends = (*of)?.anees_95;
+        Some([ends.0, ends.1].map(|x| (x, -(row as f64))))
+    });
+    Chart::new(
+        "Mean NEES / 2 of each way to fly (above 1: over-confident)",
+        Axis::linear("ANEES / 2").within(0.8, 1.2),
+        Axis::named(names.collect()),
+    )
+    .with(Series::new(
+        "95 % of honest runs",
+        Mark::Spans,
+        honest.flatten().collect(),
+    ))
+    .with(dots("measured", &kinds, |(_, of)| of.map(|of| of.anees)))
+}
+
 fn bounds(cells: &[Cell]) -> Sheet {
-    let points = |value: fn(&Cell) -> Option<f64>| {
-        cells
-            .iter()
-            .enumerate()
-            .filter_map(|(index, cell)| Some((index as f64, value(cell)?)))
-            .collect()
+    let name = |cell: &Cell| {
+        let ground = if cell.terrain {
+            "ground known"
+        } else {
+            "no ground"
+        };
+        format!("{}, {}, {ground}", cell.kind.name(), cell.gnss.name())
     };
-    let last = cells.len().max(2) as f64 - 1.0;
     Sheet::of(
         Chart::new(
-            "RMSE over the Cramér-Rao bound, one dot per row of the table",
-            Axis::linear("row"),
+            "RMSE over the Cramér-Rao bound",
             Axis::log("RMSE / bound"),
+            Axis::named(cells.iter().map(name).collect()),
         )
-        .with(Series::new(
-            "bound",
-            Mark::Dashed,
-            vec![(0.0, 1.0), (last, 1.0)],
-        ))
-        .with(Series::new(
-            "allowed",
-            Mark::Dashed,
-            vec![(0.0, 1.15), (last, 1.15)],
-        ))
-        .with(Series::new(
-            "emberfix",
-            Mark::Dots,
-            points(|cell| cell.rmse_over_bound),
-        ))
-        .with(Series::new(
-            "P3 as printed, corrected",
-            Mark::Dots,
-            points(|cell| cell.printed_over_bound),
-        )),
+        .with(upright("bound", 1.0, cells.len()))
+        .with(upright("allowed", ALLOWED_OVER_BOUND, cells.len()))
+        .with(dots("emberfix", cells, |cell| cell.rmse_over_bound))
+        .with(dots("P3 as printed, corrected", cells, |cell| {
+            cell.printed_over_bound
+        })),
     )
 }

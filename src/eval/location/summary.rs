@@ -1,6 +1,8 @@
 //! The campaign's figures, tables and details.
 
-use super::cells::{Cell, LawRow, alarms, cell_table, cells, law_row, law_table, of_kind};
+use super::cells::{
+    ALLOWED_OVER_BOUND, Cell, LawRow, alarms, cell_table, cells, law_row, law_table, of_kind,
+};
 use super::flight::Kind;
 use super::incidents::{FALSE_BOX, MISS, SIGMA_LOOKS, SIGMAS_APART, share_right};
 use super::law::Law;
@@ -35,7 +37,13 @@ pub(super) fn report(options: &Options, campaign: &Campaign) -> Report {
     let observable = campaign.flown.iter().filter(|f| f.observable).count();
     figures.insert(
         0,
-        most("location.rmse_over_bound", worst, "", 1.15, observable),
+        most(
+            "location.rmse_over_bound",
+            worst,
+            "",
+            ALLOWED_OVER_BOUND,
+            observable,
+        ),
     );
     figures.extend(p3_figures(&p3));
     figures.extend(mount_figures(&gusty, &consumer, &steady));

@@ -14,12 +14,12 @@ use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
 
 /// Number of errors that stay from look to look.
-pub const SLOW: usize = 14;
+pub const SLOW: usize = 17;
 
 /// Errors that stay from look to look: what must be added to the truth to get what is reported.
 /// Order: GNSS east, north, up (m); heading (rad, clockwise); tilt about the nose and about the
 /// right wing (rad); boresight about the three body axes (rad); disparity (px); camera clock late
-/// (s); lever arm along the three body axes (m).
+/// (s); lever arm along the three body axes (m); velocity east, north, up (m/s).
 pub type Slow = SVector<f64, SLOW>;
 
 /// First index of each group in [`Slow`].
@@ -38,6 +38,8 @@ pub mod slow {
     pub const CLOCK: usize = 10;
     /// Lever arm ahead.
     pub const LEVER: usize = 11;
+    /// Velocity east.
+    pub const VELOCITY: usize = 14;
 }
 
 /// How large errors are and how fast they wander: what the service is told in its rig and mission,
@@ -52,6 +54,10 @@ pub struct ErrorModel {
     pub gnss_constant_share: f64,
     /// Correlation time of the rest, seconds.
     pub gnss_correlation_s: f64,
+    /// Velocity sigma per axis, m/s.
+    pub velocity_m_s: f64,
+    /// Correlation time of all of it, seconds.
+    pub velocity_correlation_s: f64,
     /// Heading sigma, degrees.
     pub heading_deg: f64,
     /// Share of the heading variance that is constant in a flight.
@@ -92,6 +98,8 @@ impl ErrorModel {
             gnss_vertical_m,
             gnss_constant_share: 0.5,
             gnss_correlation_s: 60.0,
+            velocity_m_s: 0.05,
+            velocity_correlation_s: 1.0,
             heading_deg,
             heading_constant_share: 0.7,
             heading_correlation_s: 60.0,
@@ -115,6 +123,7 @@ impl ErrorModel {
         Self {
             gnss_horizontal_m: scale * self.gnss_horizontal_m,
             gnss_vertical_m: scale * self.gnss_vertical_m,
+            velocity_m_s: scale * self.velocity_m_s,
             heading_deg: scale * self.heading_deg,
             tilt_deg: scale * self.tilt_deg,
             boresight_deg: scale * self.boresight_deg,
@@ -148,6 +157,9 @@ impl ErrorModel {
             self.lever_arm_m,
             self.lever_arm_m,
             self.lever_arm_m,
+            self.velocity_m_s,
+            self.velocity_m_s,
+            self.velocity_m_s,
         ])
     }
 
@@ -160,6 +172,7 @@ impl ErrorModel {
                 self.gnss_constant_share,
                 self.heading_constant_share,
                 self.tilt_constant_share,
+                0.0,
             ],
         )
     }
@@ -173,15 +186,17 @@ impl ErrorModel {
                 self.gnss_correlation_s,
                 self.heading_correlation_s,
                 self.tilt_correlation_s,
+                self.velocity_correlation_s,
             ],
         )
     }
 
-    fn wanderers(&self, others: f64, [gnss, heading, tilt]: [f64; 3]) -> Slow {
+    fn wanderers(&self, others: f64, [gnss, heading, tilt, velocity]: [f64; 4]) -> Slow {
         let mut values = Slow::repeat(others);
         values.rows_mut(slow::GNSS, 3).fill(gnss);
         values[slow::HEADING] = heading;
         values.rows_mut(slow::TILT, 2).fill(tilt);
+        values.rows_mut(slow::VELOCITY, 3).fill(velocity);
         values
     }
 }
@@ -421,7 +436,6 @@ pub struct Autopilot<'a> {
     slow: Slow,
     turn_rad: Vector3<f64>,
     moved_m: Vector3<f64>,
-    velocity_m_s: Vector3<f64>,
     rate_rad_s: Vector3<f64>,
 }
 
@@ -440,7 +454,6 @@ impl<'a> Autopilot<'a> {
             slow: *slow,
             turn_rad: normal3(rng, errors.attitude_noise_rad),
             moved_m: normal3(rng, errors.position_noise_m),
-            velocity_m_s: normal3(rng, 0.05),
             rate_rad_s: normal3(rng, 0.002),
         }
     }
@@ -460,7 +473,7 @@ impl<'a> Autopilot<'a> {
             t_s: self.t_s + later_s,
             position_m: state.position_m + gnss + self.moved_m,
             enu_from_body: heading.into_inner() * state.enu_from_body * turned.into_inner(),
-            velocity_m_s: state.velocity_m_s + self.velocity_m_s,
+            velocity_m_s: state.velocity_m_s + self.slow.fixed_rows::<3>(slow::VELOCITY),
             rate_rad_s: state.rate_rad_s + self.rate_rad_s,
         }
     }
@@ -477,11 +490,14 @@ pub fn wander(rng: &mut ChaCha8Rng, errors: &ErrorModel, times_s: &[f64], law: L
     let sines = (law == Law::SineDrift).then(|| Sines::drawn(rng));
     let mut values = Vec::with_capacity(times_s.len());
     for (look, t_s) in times_s.iter().enumerate() {
-        if let Some(sines) = sines {
-            now = sines.at(*t_s, &moving);
-        } else if look > 0 {
+        if look > 0 {
             let dt_s = t_s - times_s[look - 1];
             now = Slow::from_fn(|i, _| law.next(rng, i, now[i], moving[i], dt_s, correlations[i]));
+        }
+        if let Some(sines) = sines {
+            let swung = sines.at(*t_s, &moving);
+            now.rows_mut(0, slow::VELOCITY)
+                .copy_from(&swung.rows(0, slow::VELOCITY));
         }
         values.push(constant + now);
     }
