@@ -194,9 +194,10 @@ const CLOCK_SIGMAS: f64 = 1.75;
 const LOOK_AHEAD_S: f64 = 0.6;
 /// Looks that are solved again in a frame at most, but for the last fire's.
 const SOLVED_LOOKS: usize = 400;
-/// Every so many sightings a fire teaches what it has learned; neighbours in turn, lest one frame pays
-/// for all.
+/// Every so many sightings a fire teaches what it has learned, less often where more than about [`TAUGHT`]
+/// would in one frame.
 const TEACHES: u32 = 4;
+const TAUGHT: u32 = 32;
 /// Sightings in a row that may stray from a fire before another one begins there.
 const STRAYS: u8 = 8;
 /// Smoke this close to a fire's pixel, in its own sizes, is that fire's smoke.
@@ -345,8 +346,10 @@ impl Tracker {
     /// What the best known fire has learned of the shared errors is what the next one begins with.
     /// Which is best is told by how sure it is, not by what it says, so the choice bends nothing.
     fn learn(&mut self, seen: &[bool]) {
+        let all = seen.iter().filter(|is_seen| **is_seen).count() as u32;
+        let every = TEACHES.max(all / TAUGHT);
         let teaches = |fire: &Fire| {
-            fire.is_confirmed() && (fire.evidence.hits() + fire.id.0).is_multiple_of(TEACHES)
+            fire.is_confirmed() && (fire.evidence.hits() + fire.id.0).is_multiple_of(every)
         };
         let taught = self.fires.iter().zip(seen);
         let taught = taught.filter(|(fire, is_seen)| **is_seen && teaches(fire));
