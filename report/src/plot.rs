@@ -1,7 +1,9 @@
 //! Charts and sheets of charts, as SVG and PNG.
 
 use plotters::coord::Shift;
+use plotters::coord::combinators::BindKeyPoints;
 use plotters::coord::ranged1d::{AsRangedCoord, Ranged, ValueFormatter};
+use plotters::coord::types::RangedCoordf64;
 use plotters::prelude::*;
 use resvg::{tiny_skia, usvg};
 use std::ops::Range;
@@ -74,10 +76,10 @@ impl Axis {
     /// A vertical axis of names, the first at 0 on top, the next at -1, and so on.
     #[must_use]
     pub fn named(names: Vec<String>) -> Self {
-        let lowest = 0.5 - names.len().max(1) as f64;
+        let rows = names.len().max(1) as f64;
         Self {
             names,
-            ..Self::linear("").within(lowest, 0.5)
+            ..Self::linear("").within(0.5 - rows, 0.5 + LEGEND_ROWS * rows)
         }
     }
 
@@ -123,16 +125,35 @@ impl Axis {
         low - air..high + air
     }
 
+    /// Where the ticks of a logarithmic axis are: at 1, 2, 5, 10 and so on, or closer on a short one.
+    fn log_ticks(&self, range: &Range<f64>) -> Vec<f64> {
+        if range.end < 3.0 * range.start {
+            return RangedCoordf64::from(range.clone()).key_points(TICKS);
+        }
+        let decades = (range.start.log10().floor() as i32)..=(range.end.log10().ceil() as i32);
+        let of = |decade: i32| [1.0, 2.0, 5.0].map(|leading| leading * 10_f64.powi(decade));
+        decades
+            .flat_map(of)
+            .filter(|value| range.contains(value))
+            .collect()
+    }
+
+    /// Ticks at most of an axis that is not logarithmic.
+    fn most_ticks(&self) -> usize {
+        match self.names.len() {
+            0 => TICKS,
+            rows => (rows as f64 * (1.0 + LEGEND_ROWS)) as usize,
+        }
+    }
+
     /// What stands at a tick.
     fn tick(&self, value: f64) -> String {
         if self.names.is_empty() {
             return short(value);
         }
-        let named = |(index, _): &(usize, &String)| (value + *index as f64).abs() < 0.01;
-        let mut names = self.names.iter().enumerate();
-        names
-            .find(named)
-            .map_or_else(String::new, |(_, name)| name.clone())
+        let row = -value.round();
+        let name = (row >= 0.0).then(|| self.names.get(row as usize)).flatten();
+        name.cloned().unwrap_or_default()
     }
 
     /// Room for what stands at its ticks, pixels.
@@ -199,6 +220,8 @@ const NUMBERS_PX: u32 = 64;
 const LETTER_PX: u32 = 7;
 /// Ticks at most, where they are numbers.
 const TICKS: usize = 10;
+/// Room for a legend above the names of an axis, as a share of their rows.
+const LEGEND_ROWS: f64 = 0.25;
 /// Distinct also for colour-blind readers (Okabe and Ito), darkest first.
 const COLOURS: [RGBColor; 9] = [
     RGBColor(0, 114, 178),
@@ -256,11 +279,15 @@ impl Chart {
         let x = self.x.range(points().map(|point| point.0));
         let y = self.y.range(points().map(|point| point.1));
         let corner = self.emptiest_corner(&x, &y);
+        let log = |axis: &Axis, range: Range<f64>| {
+            let ticks = axis.log_ticks(&range);
+            range.log_scale().with_key_points(ticks)
+        };
         match (self.x.log, self.y.log) {
             (false, false) => self.draw_in(area, x, y, corner),
-            (true, false) => self.draw_in(area, x.log_scale(), y, corner),
-            (false, true) => self.draw_in(area, x, y.log_scale(), corner),
-            (true, true) => self.draw_in(area, x.log_scale(), y.log_scale(), corner),
+            (true, false) => self.draw_in(area, log(&self.x, x), y, corner),
+            (false, true) => self.draw_in(area, x, log(&self.y, y), corner),
+            (true, true) => self.draw_in(area, log(&self.x, x), log(&self.y, y), corner),
         }
     }
 
@@ -323,7 +350,7 @@ impl Chart {
             .configure_mesh()
             .x_desc(&self.x.label)
             .y_desc(&self.y.label)
-            .y_labels(self.y.names.len().max(TICKS))
+            .y_labels(self.y.most_ticks())
             .x_label_formatter(&|value| self.x.tick(*value))
             .y_label_formatter(&|value| self.y.tick(*value))
             .light_line_style(TRANSPARENT)
