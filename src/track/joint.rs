@@ -487,3 +487,102 @@ const ANY_TANGENT: f64 = 3.0;
 /// Inverse depths that are looked at, 1/m, and how much they change in one pass at most.
 const INVERSE_DEPTHS: (f64, f64) = (5e-4, 2.0);
 const MOST_CHANGE: f64 = 3.0;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::{pose, rig};
+    use emberfix_frames::{ServiceTime, seconds};
+    use nalgebra::{DMatrix, DVector};
+    use rand::{Rng, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    fn reading(at_s: f64, strayed_m: Vector3<f64>, variance_m2: f64) -> Reading {
+        Reading {
+            at: ServiceTime::from_unix_ns(0) + seconds(at_s),
+            strayed_m,
+            variance_m2,
+        }
+    }
+
+    fn known(seed: u64) -> Known {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let factor = SMatrix::<f64, LASTING, LASTING>::from_fn(|_, _| rng.random_range(-0.3..0.3));
+        Known {
+            mean: SVector::from_fn(|_, _| rng.random_range(-1.0..1.0)),
+            covariance: factor * factor.transpose() + SMatrix::identity() * 0.1,
+        }
+    }
+
+    /// Old errors and what is new of them written out as one normal vector, of which the velocity shows
+    /// three sums; then `x' = A x + w`.
+    fn by_hand(known: &Known, pace: &Pace, passed: &Passed) -> (DVector<f64>, DMatrix<f64>) {
+        let (n, all) = (LASTING, 2 * LASTING);
+        let mut prior = DMatrix::<f64>::zeros(all, all);
+        prior.view_mut((0, 0), (n, n)).copy_from(&known.covariance);
+        let mut keeps = DVector::repeat(n, 1.0);
+        for (i, keep) in passed.keeps.iter().enumerate() {
+            keeps[CONSTANT + i] = *keep;
+            prior[(n + CONSTANT + i, n + CONSTANT + i)] = 1.0 - keep * keep;
+        }
+        for (i, drifted) in passed.drifted.iter().enumerate() {
+            prior[(n + i, n + i)] = *drifted;
+        }
+        let mut rows = DMatrix::<f64>::zeros(3, all);
+        let mut told = DVector::<f64>::zeros(3);
+        let mut noise = DMatrix::<f64>::zeros(3, 3);
+        for (axis, strayed) in passed.receiver.iter().enumerate() {
+            for (of, i) in [CONSTANT + axis, CONSTANT + axis + NEW]
+                .into_iter()
+                .enumerate()
+            {
+                let sigma_m = pace.gnss_m[of][axis];
+                rows[(axis, i)] = sigma_m * (keeps[i] - 1.0);
+                rows[(axis, n + i)] = sigma_m;
+            }
+            told[axis] = strayed.by_m;
+            noise[(axis, axis)] = strayed.variance_m2;
+        }
+        let mut mean = DVector::<f64>::zeros(all);
+        mean.rows_mut(0, n).copy_from(&known.mean);
+        let lever = &prior * rows.transpose();
+        let gain = &lever * (&rows * &lever + noise).try_inverse().unwrap();
+        let mean = &mean + &gain * (told - &rows * &mean);
+        let covariance = &prior - &gain * lever.transpose();
+        let mut next = DMatrix::<f64>::zeros(n, all);
+        next.view_mut((0, 0), (n, n))
+            .copy_from(&DMatrix::from_diagonal(&keeps));
+        next.view_mut((0, n), (n, n)).fill_with_identity();
+        (&next * mean, &next * covariance * next.transpose())
+    }
+
+    #[test]
+    fn what_the_velocity_says_of_the_receiver_is_taken_in_exactly() {
+        let priors = SharedPriors::default();
+        let pace = Pace::new(&priors, &priors.sigmas(&pose(0.0, 0.0, 0.0), &rig(30.0)));
+        for seed in 0..20 {
+            let mut aged = known(seed);
+            let (from, to) = (
+                reading(1.0, Vector3::zeros(), 0.2),
+                reading(1.4, Vector3::new(0.3, -0.2, 0.05), 0.21),
+            );
+            let (mean, covariance) = by_hand(&aged, &pace, &pace.passed(&from, &to));
+            aged.age(&from, &to, &pace);
+            assert!((aged.mean - mean).amax() < 1e-12);
+            assert!((aged.covariance - covariance).amax() < 1e-12);
+        }
+    }
+
+    #[test]
+    fn in_no_time_nothing_changes() {
+        let priors = SharedPriors::default();
+        let pace = Pace::new(&priors, &priors.sigmas(&pose(0.0, 0.0, 0.0), &rig(30.0)));
+        let (before, mut after) = (known(1), known(1));
+        let now = reading(3.0, Vector3::new(1.0, 2.0, 3.0), 0.4);
+        after.age(&now, &now, &pace);
+        assert_eq!(
+            (before.mean, before.covariance),
+            (after.mean, after.covariance)
+        );
+    }
+}

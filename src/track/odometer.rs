@@ -107,3 +107,57 @@ impl Flown {
         (reported - self.strayed_m) * self.share
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::locate::SharedPriors;
+    use crate::testing::{datum, pose, rig};
+    use emberfix_frames::{Coordinate, Metres, VehicleEnu, ecef_from_enu, seconds};
+
+    /// Reported 3 m to the east and 1 m up of where a flight at a steady speed has come after a second,
+    /// at ten frames.
+    fn drifted() -> (Reading, Reading) {
+        let (rig, datum, priors) = (rig(30.0), datum(), SharedPriors::default());
+        let mut odometer: Option<Odometer> = None;
+        let mut first = None;
+        for frame in 0..=10 {
+            let t_s = 0.1 * f64::from(frame);
+            let mut pose = pose(0.0, 0.0, 0.0);
+            let moved = pose.velocity_enu_m_s * t_s + Vector3::new(3.0, 0.0, 1.0) * t_s;
+            pose.at = pose.at + seconds(t_s);
+            pose.place = ecef_from_enu(&datum)
+                .transform(Coordinate::<VehicleEnu>::from_metres(moved))
+                .to_wgs84();
+            let view = View::new(&rig, &pose, &priors, &datum);
+            let reading = odometer
+                .get_or_insert_with(|| Odometer::new(&view))
+                .go_on(&view);
+            first = first.or(Some(reading));
+        }
+        (first.unwrap(), odometer.unwrap().reading())
+    }
+
+    #[test]
+    fn what_no_velocity_explains_the_receiver_has_strayed() {
+        let (first, last) = drifted();
+        let off = last.strayed_m - first.strayed_m - Vector3::new(3.0, 0.0, 1.0);
+        assert!(off.norm() < 1e-6, "{off}");
+        // 0.1 m/s that last a second, for a second; the bend within a tenth of one is nothing.
+        assert!(
+            (last.variance_m2 - 0.02).abs() < 1e-6,
+            "{}",
+            last.variance_m2
+        );
+    }
+
+    #[test]
+    fn a_receiver_that_wanders_less_than_the_way_errs_is_believed() {
+        let (first, last) = drifted();
+        let (strayed_m, variances) = last.strayed_since(&first, &Vector3::repeat(1e-6));
+        assert!(strayed_m.norm() < 1e-3 && variances.amax() < 1e-6);
+        let (strayed_m, variances) = last.strayed_since(&first, &Vector3::repeat(1e3));
+        assert!((strayed_m - Vector3::new(3.0, 0.0, 1.0)).norm() < 1e-3);
+        assert!((variances.x - 0.02).abs() < 1e-5);
+    }
+}
