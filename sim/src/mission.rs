@@ -360,6 +360,7 @@ fn check_path(checks: &mut Checks, path: &PathConfig) {
             waypoints_m,
             speed_m_s,
             laps,
+            ..
         } => {
             checks.range("sim.flight.path.laps", f64::from(*laps), 1.0, 1e3);
             checks.range("sim.flight.path.speed_m_s", *speed_m_s, 0.5, 60.0);
@@ -421,6 +422,7 @@ pub(crate) mod tests {
                 waypoints_m,
                 speed_m_s: 5.5,
                 laps: 1,
+                look_at_m: None,
             },
             gusts: GustConfig::calm(),
         }

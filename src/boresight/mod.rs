@@ -5,15 +5,15 @@
 //! place of the marker. **In:** [`Sight`]s (pixels of the raw left image, and the way that the airframe
 //! took about that moment, in the plane at the mission datum), a [`Start`] with the rig as it is and what
 //! is known beforehand. **Out:** a [`Solution`]: every parameter with its sigma, the covariance of all, and
-//! `words` that say what the flight could not show and what to fly instead. `solve`, `model` and `words`
-//! are pure; `flight` reads recordings, `rig_file` writes rigs.
+//! `words` that say what the flight could not show and what to fly instead. `solve`, `model`, `wander` and
+//! `words` are pure; `flight` reads recordings, `rig_file` writes rigs.
 //!
 //! **Method.** Gauss-Newton with Levenberg's damping on the projection of the marker, Cauchy weights
-//! against wrong picks, several starts over the clock. Residuals of neighbouring pictures resemble each
-//! other (attitude errors wander): the covariance is widened by that, so that more pictures a second do
-//! not make it smaller than it is.
+//! against wrong picks, several starts over the clock. Heading, tilt and GNSS wander while the flight goes
+//! on, and are solved for as processes (`wander`). Where residuals of neighbouring pictures still resemble
+//! each other the covariance is widened, so that more pictures a second do not make it smaller than it is.
 //!
-//! **Assumptions.** The marker stands still; the autopilot's errors are constant in the flight.
+//! **Assumptions.** The marker stands still; the autopilot's errors wander as the mission says.
 //! **Known limits.** What cannot be told apart stays open, and is said: the mount's yaw from the heading's
 //! error, the lever arm from a GNSS offset in body axes, a GNSS offset without a surveyed marker.
 
@@ -23,10 +23,12 @@ pub mod rig_file;
 mod solve;
 #[cfg(test)]
 mod tests;
+mod wander;
 mod words;
 
 pub use flight::{Gathered, Marker, Picker, Picks, PicksError, gather};
 pub(crate) use model::mount_of;
 pub use model::{BodyAt, Parameter, Sight, Start, Way};
 pub use solve::{Solution, SolveError, solve};
+pub use wander::Wandering;
 pub use words::observability;

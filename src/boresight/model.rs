@@ -1,6 +1,7 @@
 //! What the left camera sees of the marker, as a function of everything that may be wrong.
 
 use super::flight::Marker;
+use super::wander::{WANDERING, Wandering};
 use crate::mission::Mission;
 use crate::pose::Pose;
 use emberfix_calib::{Camera, Eye, RawPixel, Rig};
@@ -29,7 +30,8 @@ pub enum Parameter {
     Arm = 3,
     /// `time.camera_offset_s` minus the rig file's: positive, the camera's stamps are earlier still.
     Clock = 6,
-    /// Autopilot's heading minus true heading, clockwise.
+    /// Autopilot's heading minus true heading, clockwise. This, tilt and position may wander, see
+    /// [`Wandering`].
     Heading = 7,
     /// Autopilot's tilt minus the true one, about east; about north follows.
     Tilt = 8,
@@ -143,8 +145,10 @@ pub struct Start {
     pub arm_m: Vector3<f64>,
     /// Where the marker is, if it was surveyed, metres in the plane at the datum.
     pub marker_m: Option<Vector3<f64>>,
-    /// One sigma of every parameter beforehand.
+    /// One sigma of every parameter beforehand; of what wanders, the part that stays.
     pub sigmas: Parameters,
+    /// How heading, tilt (2) and GNSS (3) wander, in the order of [`Parameter`].
+    pub wandering: [Wandering; WANDERING],
 }
 
 impl Start {
@@ -158,14 +162,10 @@ impl Start {
         };
         set(arm, 3, rig.sigmas().lever_arm_m.max(LEAST_ARM_M));
         set(Parameter::Clock as usize, 1, CLOCK_SIGMA_S);
-        set(Parameter::Heading as usize, 1, mission.shared.heading_rad);
-        set(Parameter::Tilt as usize, 2, mission.shared.tilt_rad);
-        set(Parameter::Gnss as usize, 2, mission.pose.gnss_horizontal_m);
-        set(
-            Parameter::Gnss as usize + 2,
-            1,
-            mission.pose.gnss_vertical_m,
-        );
+        let slow = slow_errors(mission);
+        for (index, error) in (Parameter::Heading as usize..).zip(slow) {
+            set(index, 1, error.sigma);
+        }
         let marker_sigma_m = marker.map_or(NOWHERE_M, |marker| marker.sigma_m);
         set(Parameter::Marker as usize, 3, marker_sigma_m);
         Self {
@@ -174,11 +174,10 @@ impl Start {
             arm_m: arm_of(rig),
             marker_m: marker.map(|marker| marker.enu_m(&mission.datum)),
             sigmas,
+            wandering: slow,
         }
     }
-}
 
-impl Start {
     /// Where the surveyed marker should be seen if the rig file were right and the clock off by
     /// `clock_s`; `None` behind the camera.
     pub(super) fn predict(&self, way: &Way, clock_s: f64) -> Option<RawPixel> {
@@ -188,6 +187,26 @@ impl Start {
             .copy_from(&self.marker_m?);
         Model::new(self, &x).predict(way)
     }
+}
+
+/// Heading, tilt about two axes, GNSS along three: in the order of [`Parameter`]. How much of an error stays
+/// for a flight is not known well enough to lean on: what stays and what wanders have the whole sigma each.
+fn slow_errors(mission: &Mission) -> [Wandering; WANDERING] {
+    let (shared, pose) = (&mission.shared, &mission.pose);
+    let heading = Wandering {
+        sigma: shared.heading_rad,
+        correlation_s: shared.heading_correlation_s,
+    };
+    let tilt = Wandering {
+        sigma: shared.tilt_rad,
+        correlation_s: shared.tilt_correlation_s,
+    };
+    let gnss = |sigma| Wandering {
+        sigma,
+        correlation_s: shared.gnss_correlation_s,
+    };
+    let (level, up) = (pose.gnss_horizontal_m, pose.gnss_vertical_m);
+    [heading, tilt, tilt, gnss(level), gnss(level), gnss(up)]
 }
 
 fn arm_of(rig: &Rig) -> Vector3<f64> {

@@ -1,10 +1,12 @@
 //! The batch: Gauss-Newton, damped, robust.
 
 use super::model::{Model, N, Parameter, Parameters, Sight, Start, mount_of, part};
+use super::wander::{Prior, Unknowns};
 use emberfix_frames::{MountAngles, UnitQuaternion, Vector3};
-use nalgebra::{Matrix3, SMatrix, SVector};
+use nalgebra::{DMatrix, Matrix3, SMatrix, SVector};
 
-type Normal = SMatrix<f64, N, N>;
+type Normal = DMatrix<f64>;
+type Residual = SVector<f64, 2>;
 
 /// Why there is no solution.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
@@ -36,7 +38,7 @@ pub enum SolveError {
 /// What the flight showed.
 #[derive(Debug, Clone)]
 pub struct Solution {
-    /// Every parameter, see [`Parameter`].
+    /// Every parameter, see [`Parameter`]; of what wanders, the part that stays.
     pub parameters: SVector<f64, N>,
     /// Covariance of all parameters.
     pub covariance: SMatrix<f64, N, N>,
@@ -139,16 +141,22 @@ pub fn solve(start: &Start, sights: &[Sight]) -> Result<Solution, SolveError> {
     }
     let every = sights.len().div_ceil(FIRST_LOOK);
     let few: Vec<Sight> = sights.iter().step_by(every).cloned().collect();
+    let prior = Prior::new(start, sights);
     let glance = Batch {
         start,
         sights: &few,
+        prior: &prior,
     };
     let first_looks = CLOCK_STARTS_S.map(|clock| glance.search(glance.begin(clock), STEPS.0));
     let best = first_looks
         .into_iter()
         .min_by(|a, b| a.robust.total_cmp(&b.robust))
         .ok_or(SolveError::NotFinite)?;
-    let batch = Batch { start, sights };
+    let batch = Batch {
+        start,
+        sights,
+        prior: &prior,
+    };
     let found = batch.search(best.x, STEPS.1);
     batch.conclude(&found)
 }
@@ -156,13 +164,14 @@ pub fn solve(start: &Start, sights: &[Sight]) -> Result<Solution, SolveError> {
 struct Batch<'a> {
     start: &'a Start,
     sights: &'a [Sight],
+    prior: &'a Prior,
 }
 
 /// Where a search stands.
 struct Found {
-    x: Parameters,
+    x: Unknowns,
     /// In sights' sigmas.
-    residuals: Vec<SVector<f64, 2>>,
+    residuals: Vec<Residual>,
     /// Scale of the residuals, in sights' sigmas.
     scale: f64,
     /// Median of the residuals' lengths, in sights' sigmas: compares searches, whatever their scale.
@@ -170,21 +179,23 @@ struct Found {
 }
 
 impl Batch<'_> {
-    fn begin(&self, clock_s: f64) -> Parameters {
-        let mut x = Parameters::zeros();
+    fn begin(&self, clock_s: f64) -> Unknowns {
+        let mut x = self.prior.mean().clone();
         x[Parameter::Clock as usize] = clock_s;
-        let marker = self.start.marker_m.unwrap_or_else(|| self.meeting(&x));
-        x.fixed_rows_mut::<3>(Parameter::Marker as usize)
-            .copy_from(&marker);
+        if self.start.marker_m.is_none() {
+            let marker = self.meeting(clock_s);
+            x.fixed_rows_mut::<3>(Parameter::Marker as usize)
+                .copy_from(&marker);
+        }
         x
     }
 
     /// The point nearest to all rays: where an unsurveyed marker may be.
-    fn meeting(&self, x: &Parameters) -> Vector3<f64> {
+    fn meeting(&self, clock_s: f64) -> Vector3<f64> {
         let (mut normal, mut sum) = (Matrix3::identity() * 1e-9, Vector3::zeros());
         let body_from_camera = self.start.body_from_camera;
         for sight in self.sights {
-            let Some(body) = sight.way.at(x[Parameter::Clock as usize]) else {
+            let Some(body) = sight.way.at(clock_s) else {
                 continue;
             };
             let ray = body.enu_from_body * (body_from_camera * self.direction(sight));
@@ -210,43 +221,31 @@ impl Batch<'_> {
         ray.normalize()
     }
 
-    /// Residual of every sight in its sigmas; what cannot be seen is far off.
-    fn residuals(&self, x: &Parameters) -> Vec<SVector<f64, 2>> {
-        let model = Model::new(self.start, x);
-        let one = |sight: &Sight| match model.predict(&sight.way) {
+    /// Residual of a sight in its sigmas; what cannot be seen is far off.
+    fn residual(&self, sight: &Sight, moment: &Parameters) -> Residual {
+        match Model::new(self.start, moment).predict(&sight.way) {
             Some(pixel) => {
-                SVector::<f64, 2>::new(pixel.u - sight.pixel.u, pixel.v - sight.pixel.v)
-                    / sight.sigma_px
+                Residual::new(pixel.u - sight.pixel.u, pixel.v - sight.pixel.v) / sight.sigma_px
             }
-            None => SVector::repeat(UNSEEN / sight.sigma_px),
-        };
+            None => Residual::repeat(UNSEEN / sight.sigma_px),
+        }
+    }
+
+    fn residuals(&self, x: &Unknowns) -> Vec<Residual> {
+        let one = |sight: &Sight| self.residual(sight, &self.prior.moment(x, sight.at));
         self.sights.iter().map(one).collect()
     }
 
     /// Cauchy's cost at a scale, and the cost of leaving what was known beforehand; in units of the
     /// sights' sigma², whatever the scale.
-    fn cost(&self, x: &Parameters, residuals: &[SVector<f64, 2>], scale: f64) -> f64 {
+    fn cost(&self, x: &Unknowns, residuals: &[Residual], scale: f64) -> f64 {
         let width = CAUCHY * scale;
-        let one = |residual: &SVector<f64, 2>| (residual.norm() / width).powi(2).ln_1p();
+        let one = |residual: &Residual| (residual.norm() / width).powi(2).ln_1p();
         let seen: f64 = residuals.iter().map(one).sum();
-        seen * width * width + self.known(x).norm_squared() * scale * scale
+        seen * width * width + self.prior.distance_squared(x) * scale * scale
     }
 
-    /// Distance from what was known, in its sigmas.
-    fn known(&self, x: &Parameters) -> Parameters {
-        let mut known = *x;
-        let marker = Parameter::Marker as usize;
-        match self.start.marker_m {
-            Some(surveyed) => {
-                let off = part(x, Parameter::Marker) - surveyed;
-                known.fixed_rows_mut::<3>(marker).copy_from(&off);
-            }
-            None => known.fixed_rows_mut::<3>(marker).fill(0.0),
-        }
-        known.component_div(&self.start.sigmas)
-    }
-
-    fn search(&self, mut x: Parameters, steps: usize) -> Found {
+    fn search(&self, mut x: Unknowns, steps: usize) -> Found {
         let mut residuals = self.residuals(&x);
         let mut scale = scale_of(&residuals);
         let mut cost = self.cost(&x, &residuals, scale);
@@ -255,7 +254,7 @@ impl Batch<'_> {
         for _ in 0..steps {
             let (normal, gradient) = &system;
             let damped = normal + Normal::from_diagonal(&(normal.diagonal() * damping));
-            let there = damped.cholesky().map(|c| x - c.solve(gradient));
+            let there = damped.cholesky().map(|c| &x - c.solve(gradient));
             let then = there.map(|there| {
                 let residuals = self.residuals(&there);
                 (self.cost(&there, &residuals, scale), there, residuals)
@@ -286,45 +285,43 @@ impl Batch<'_> {
     }
 
     /// Normal equations, weighted; what was known beforehand is in them.
-    fn linearise(
-        &self,
-        x: &Parameters,
-        residuals: &[SVector<f64, 2>],
-        scale: f64,
-    ) -> (Normal, Parameters) {
-        let known = Parameters::from_element(1.0).component_div(&self.start.sigmas);
-        let weight = scale * scale;
-        let mut normal = Normal::from_diagonal(&(known.component_mul(&known) * weight));
-        let mut gradient = self.known(x).component_mul(&known) * weight;
-        for (by, residual) in self.derivatives(x, residuals).iter().zip(residuals) {
+    fn linearise(&self, x: &Unknowns, residuals: &[Residual], scale: f64) -> (Normal, Unknowns) {
+        let prior = self.prior.information() * (scale * scale);
+        let mut gradient = &prior * (x - self.prior.mean());
+        let mut normal = prior;
+        for (sight, residual) in self.sights.iter().zip(residuals) {
+            let by = self.derivative(x, sight, residual);
+            let (by, places) = self.prior.spread(&by, sight.at);
             let weight = cauchy_weight(residual.norm(), scale);
-            normal += by.transpose() * by * weight;
-            gradient += by.transpose() * residual * weight;
+            let (square, slope) = (
+                by.transpose() * by * weight,
+                by.transpose() * residual * weight,
+            );
+            for (i, row) in places.iter().enumerate() {
+                gradient[*row] += slope[i];
+                for (j, column) in places.iter().enumerate() {
+                    normal[(*row, *column)] += square[(i, j)];
+                }
+            }
         }
         (normal, gradient)
     }
 
-    /// Of every sight's residual over the parameters, by forward differences.
-    fn derivatives(
-        &self,
-        x: &Parameters,
-        residuals: &[SVector<f64, 2>],
-    ) -> Vec<SMatrix<f64, 2, N>> {
-        let mut all = vec![SMatrix::<f64, 2, N>::zeros(); residuals.len()];
+    /// Of a sight's residual over the parameters at its moment, by forward differences.
+    fn derivative(&self, x: &Unknowns, sight: &Sight, residual: &Residual) -> SMatrix<f64, 2, N> {
+        let moment = self.prior.moment(x, sight.at);
+        let mut by = SMatrix::<f64, 2, N>::zeros();
         for index in 0..N {
             let step = step_of(index);
-            let mut there = *x;
+            let mut there = moment;
             there[index] += step;
-            let moved = self.residuals(&there);
-            for ((by, after), before) in all.iter_mut().zip(&moved).zip(residuals) {
-                by.set_column(index, &((after - before) / step));
-            }
+            by.set_column(index, &((self.residual(sight, &there) - residual) / step));
         }
-        all
+        by
     }
 
     fn conclude(&self, found: &Found) -> Result<Solution, SolveError> {
-        let x = found.x;
+        let x: Parameters = found.x.fixed_rows::<N>(0).into_owned();
         let limit = OUTLIER * found.scale.min(MOST_SCALE);
         let kept: Vec<usize> = (0..self.sights.len())
             .filter(|sight| found.residuals[*sight].norm() <= limit)
@@ -357,19 +354,20 @@ impl Batch<'_> {
         })
     }
 
-    /// What was measured, at its own scale and widened, and what was known beforehand.
-    fn covariance(&self, found: &Found, widened: f64) -> Option<Normal> {
-        let known = Parameters::from_element(1.0).component_div(&self.start.sigmas);
-        let mut information = Normal::from_diagonal(&known.component_mul(&known));
-        let derivatives = self.derivatives(&found.x, &found.residuals);
-        for (by, residual) in derivatives.iter().zip(&found.residuals) {
-            let weight = cauchy_weight(residual.norm(), found.scale);
-            information += by.transpose() * by * (weight / (found.scale.powi(2) * widened));
-        }
+    /// Of the parameters: what was measured, at its own scale and widened, and what was known beforehand.
+    fn covariance(&self, found: &Found, widened: f64) -> Option<SMatrix<f64, N, N>> {
+        let (normal, _) = self.linearise(&found.x, &found.residuals, found.scale);
+        let prior = self.prior.information();
+        let weight = found.scale * found.scale;
+        let measured = (normal - prior * weight) / (weight * widened);
         // Scaled by what was known, so that radians and metres of kilometres do not spoil the inverse.
-        let units = Normal::from_diagonal(&self.start.sigmas);
-        let inverse = (units * information * units).cholesky()?.inverse();
-        Some(units * inverse * units)
+        let units = Normal::from_diagonal(self.prior.sigmas());
+        let inverse = (&units * (measured + prior) * &units).cholesky()?.inverse();
+        Some(
+            (&units * inverse * &units)
+                .fixed_view::<N, N>(0, 0)
+                .into_owned(),
+        )
     }
 
     fn mount(&self, x: &Parameters) -> MountAngles {
@@ -419,24 +417,24 @@ fn step_of(index: usize) -> f64 {
 
 /// Sigma of the residuals per axis, in sights' sigmas, from their median length; never below what the
 /// sights claim of themselves.
-fn scale_of(residuals: &[SVector<f64, 2>]) -> f64 {
+fn scale_of(residuals: &[Residual]) -> f64 {
     // Median length of a two-dimensional normal distribution of sigma 1.
     (median_length(residuals) / 1.1774).max(1.0)
 }
 
-fn median_length(residuals: &[SVector<f64, 2>]) -> f64 {
-    let mut lengths: Vec<f64> = residuals.iter().map(SVector::norm).collect();
+fn median_length(residuals: &[Residual]) -> f64 {
+    let mut lengths: Vec<f64> = residuals.iter().map(Residual::norm).collect();
     lengths.sort_by(f64::total_cmp);
     lengths.get(lengths.len() / 2).copied().unwrap_or(0.0)
 }
 
 /// Factor on the variance for neighbours that resemble each other: `(1 + r) / (1 - r)` for a
 /// first-order process whose neighbours correlate by `r`.
-fn widening(residuals: impl Iterator<Item = SVector<f64, 2>>) -> f64 {
+fn widening(residuals: impl Iterator<Item = Residual>) -> f64 {
     let (mut power, mut along, mut before) = (1e-30, 0.0, None);
     for residual in residuals {
         power += residual.norm_squared();
-        along += before.map_or(0.0, |before: SVector<f64, 2>| before.dot(&residual));
+        along += before.map_or(0.0, |before: Residual| before.dot(&residual));
         before = Some(residual);
     }
     let r = (along / power).clamp(0.0, 0.95);

@@ -1,7 +1,9 @@
 //! Flights in numbers: what was put in is found, and what cannot be found is said.
 
 use super::model::{Model, N, Parameters, mount_of};
-use super::{BodyAt, Parameter, Sight, Solution, SolveError, Start, Way, observability, solve};
+use super::{
+    BodyAt, Parameter, Sight, Solution, SolveError, Start, Wandering, Way, observability, solve,
+};
 use crate::testing::rig;
 use emberfix_calib::Eye;
 use emberfix_frames::{
@@ -75,8 +77,15 @@ fn start(surveyed: bool) -> Start {
         arm_m: Vector3::zeros(),
         marker_m: surveyed.then(Vector3::zeros),
         sigmas,
+        wandering: [STILL; 6],
     }
 }
+
+/// What does not wander.
+const STILL: Wandering = Wandering {
+    sigma: 0.0,
+    correlation_s: 100.0,
+};
 
 /// Three degrees in all, and 300 ms.
 fn truth() -> Parameters {
@@ -243,6 +252,54 @@ fn neighbours_that_resemble_each_other_widen_the_sigmas() {
     assert!(solution.widened > 2.0, "{}", solution.widened);
     let (wide, narrow) = (solution.boresight_sigma(), white.boresight_sigma());
     assert!(wide > 1.5 * narrow, "{wide} {narrow}");
+}
+
+/// Tilts what is believed of the airframe by Gauss-Markov processes about east and north.
+fn wandering_tilt(rng: &mut ChaCha8Rng, tilt: Wandering, sights: &mut [Sight]) {
+    let mut now = [tilt.sigma * noise(rng), tilt.sigma * noise(rng)];
+    let mut before = sights[0].at;
+    for sight in sights {
+        let keep = (-(sight.at - before).as_secs_f64() / tilt.correlation_s).exp();
+        let renew = tilt.sigma * (1.0 - keep * keep).sqrt();
+        now = now.map(|value| keep * value + renew * noise(rng));
+        before = sight.at;
+        let turn = UnitQuaternion::from_scaled_axis(Vector3::new(now[0], now[1], 0.0));
+        for body in &mut sight.way.bodies {
+            body.enu_from_body = turn * body.enu_from_body;
+        }
+    }
+}
+
+#[test]
+fn a_tilt_that_wanders_is_not_pressed_into_the_mount() {
+    let tilt = Wandering {
+        sigma: 0.3_f64.to_radians(),
+        correlation_s: 15.0,
+    };
+    let mut as_process = start(true);
+    as_process.sigmas[Parameter::Tilt as usize] = tilt.sigma;
+    as_process.sigmas[Parameter::Tilt as usize + 1] = tilt.sigma;
+    let as_constant = as_process.clone();
+    as_process.wandering = [STILL, tilt, tilt, STILL, STILL, STILL];
+    let (mut process, mut constant, mut within, mut all) = (0.0, 0.0, 0, 0);
+    for seed in 0..20 {
+        let mut sights = fly(weaving, 200 + seed, 1.0);
+        wandering_tilt(&mut ChaCha8Rng::seed_from_u64(seed), tilt, &mut sights);
+        let solution = solve(&as_process, &sights).unwrap();
+        process += boresight_error_deg(&solution).powi(2);
+        constant += boresight_error_deg(&solve(&as_constant, &sights).unwrap()).powi(2);
+        for axis in 0..3 {
+            let error = (solution.parameters[axis] - truth()[axis]).abs();
+            within += usize::from(error < 2.0 * solution.sigma(axis));
+            all += 1;
+        }
+    }
+    assert!(
+        process < 0.5 * constant,
+        "mean squares {process} and {constant}"
+    );
+    // 95 % of 60 is 57; four fewer than that happens once in a hundred.
+    assert!(within >= 53, "{within} of {all} within two sigma");
 }
 
 #[test]

@@ -7,7 +7,7 @@ use serde::Deserialize;
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(tag = "pattern", rename_all = "snake_case", deny_unknown_fields)]
 pub enum PathConfig {
-    /// Through points, nose along the course.
+    /// Through points, nose along the course or held on one place.
     Patrol {
         /// East, north, height above the ground there; metres.
         waypoints_m: Vec<[f64; 3]>,
@@ -16,6 +16,10 @@ pub enum PathConfig {
         /// How often to fly through all of them, from the last to the first again.
         #[serde(default = "one_lap")]
         laps: u16,
+        /// East, north of the place on which the nose is held (the autopilot's region of interest), metres;
+        /// along the course when absent.
+        #[serde(default)]
+        look_at_m: Option<[f64; 2]>,
     },
     /// Around a point.
     Orbit {
@@ -52,7 +56,10 @@ pub enum Nose {
 
 #[derive(Debug, Clone)]
 pub(super) enum Path {
-    Patrol(Spline),
+    Patrol {
+        way: Spline,
+        look_at_m: Option<Vector3<f64>>,
+    },
     Orbit(Orbit),
 }
 
@@ -72,13 +79,17 @@ impl Path {
                 waypoints_m,
                 speed_m_s,
                 laps,
+                look_at_m,
             } => {
                 let above_ground = |&[east, north, height]: &[f64; 3]| {
                     Vector3::new(east, north, ground_up_m(east, north) + height)
                 };
                 let lap: Vec<_> = waypoints_m.iter().map(above_ground).collect();
                 let points = lap.repeat(usize::from(*laps));
-                Self::Patrol(Spline::new(points, *speed_m_s))
+                Self::Patrol {
+                    way: Spline::new(points, *speed_m_s),
+                    look_at_m: look_at_m.map(|[east, north]| Vector3::new(east, north, 0.0)),
+                }
             }
             PathConfig::Orbit {
                 centre_m: [east, north],
@@ -104,18 +115,22 @@ impl Path {
 
     pub(super) fn position_m(&self, t_s: f64) -> Vector3<f64> {
         match self {
-            Self::Patrol(spline) => spline.at(t_s),
+            Self::Patrol { way, .. } => way.at(t_s),
             Self::Orbit(orbit) => orbit.at(t_s),
         }
     }
 
     /// The wanted direction of the nose, level.
     pub(super) fn nose(&self, t_s: f64, velocity_m_s: Vector3<f64>) -> Vector3<f64> {
-        let course = Vector3::new(velocity_m_s.x, velocity_m_s.y, 0.0);
-        match self {
+        let nose = match self {
             Self::Orbit(orbit) if orbit.nose == Nose::Centre => orbit.centre_m - orbit.at(t_s),
-            _ => course,
-        }
+            Self::Patrol {
+                way,
+                look_at_m: Some(place),
+            } => place - way.at(t_s),
+            _ => velocity_m_s,
+        };
+        Vector3::new(nose.x, nose.y, 0.0)
     }
 }
 
@@ -236,12 +251,37 @@ mod tests {
                 waypoints_m,
                 speed_m_s: 5.0,
                 laps: 2,
+                look_at_m: None,
             },
             |_, _| 0.0,
         );
         // 30 m, 50 m and 40 m at 5 m/s.
         let again = path.position_m(24.0);
         assert!((again - Vector3::new(0.0, 0.0, 10.0)).norm() < 1e-9);
+    }
+
+    #[test]
+    fn a_nose_that_is_held_on_a_place_points_there_whatever_the_course() {
+        let path = Path::new(
+            &PathConfig::Patrol {
+                waypoints_m: vec![[0.0, -20.0, 10.0], [15.0, -20.0, 10.0]],
+                speed_m_s: 5.0,
+                laps: 1,
+                look_at_m: Some([0.0, 0.0]),
+            },
+            |_, _| 0.0,
+        );
+        let eastward = Vector3::new(5.0, 0.0, 0.0);
+        let nose = path.nose(0.0, eastward).normalize();
+        assert!(
+            (nose - Vector3::y()).norm() < 1e-12,
+            "north from the south: {nose}"
+        );
+        let nose = path.nose(3.0, eastward);
+        assert!(
+            nose.x < 0.0 && nose.y > 0.0,
+            "north-west from the south-east: {nose}"
+        );
     }
 
     #[test]
