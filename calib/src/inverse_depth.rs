@@ -3,6 +3,8 @@
 //! A baseline or focal length that is wrong by a factor shows as the scale, a constant disparity error
 //! as the offset; P1's readings, which are always too far, are both (checklist E13).
 
+use nalgebra::{DMatrix, DVector, Dyn, Matrix2, MatrixXx2, Vector2, linalg::Cholesky};
+
 /// Scale and offset of inverse depth, with their covariance.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct InverseDepth {
@@ -21,6 +23,22 @@ pub struct Reading {
     pub true_m: f64,
     /// Measured depth, metres.
     pub measured_m: f64,
+}
+
+/// Distances that are themselves estimates, and what the rig made of them, in 1/m.
+#[derive(Debug, Clone)]
+pub struct Sightings {
+    /// Inverse depths along the boresight, by all but stereo.
+    pub per_m: DVector<f64>,
+    /// Their covariance: estimates of one flight are wrong together.
+    pub covariance: DMatrix<f64>,
+    /// Measured inverse depths, without a correction.
+    pub measured_per_m: DVector<f64>,
+    /// One sigma of each by itself.
+    pub sigma_per_m: DVector<f64>,
+    /// One sigma of what is the same in every picture of one flame from like distances (what shows through it
+    /// and beside it, light from before its axis), 1/m.
+    pub alike_per_m: f64,
 }
 
 /// Why readings make no correction.
@@ -71,6 +89,17 @@ pub enum InverseDepthError {
         /// Allowed to.
         most: f64,
     },
+    /// The distances are not known well enough.
+    #[error(
+        "the correction would be known to {percent:.1} % only, allowed is {limit} %: pass the fire nearer, on \
+         more sides, with a better position (RTK), or give the fire's surveyed place"
+    )]
+    Unsure {
+        /// One sigma of a corrected distance, of the distance.
+        percent: f64,
+        /// Percent.
+        limit: f64,
+    },
     /// A line does not describe them.
     #[error(
         "reading {number} ({true_m} m) is {percent:.1} % off even when corrected, allowed is {limit} %"
@@ -94,6 +123,14 @@ pub(crate) const SCALES: (f64, f64) = (0.7, 1.4);
 /// Offsets beyond these would put infinity within ten metres.
 pub(crate) const OFFSETS_PER_M: (f64, f64) = (-0.1, 0.1);
 const WORST_PERCENT: f64 = 15.0;
+/// Largest sigma of the distance in the middle of those that were flown, of the distance.
+const UNSURE_PERCENT: f64 = 3.0;
+/// Distances that are apart by this factor share `1/e` of what is alike.
+const ALIKE_FACTOR: f64 = 1.5;
+/// Sigmas beyond which a measured distance is another fire's or none.
+const STRAY: f64 = 5.0;
+/// Rounds in which the scale weighs the distances' own errors anew.
+const ROUNDS: usize = 3;
 
 impl Default for InverseDepth {
     /// A rig that nothing is known against.
@@ -140,6 +177,37 @@ impl InverseDepth {
             covariance: [sw, -sx, sxx].map(|term| variance * term / determinant),
         };
         fitted.check(readings)?;
+        Ok(fitted)
+    }
+
+    /// Generalised least squares over sightings whose distances are estimates: their covariance, and what the
+    /// pictures of one flame have in common, are not averaged away. What makes every flame look too far or too
+    /// near is corrected with the rig's own part, for it is the same to whoever measures with both.
+    ///
+    /// # Errors
+    /// [`InverseDepthError`]: too few, too alike, not known well enough, or not those of a stereo rig.
+    pub fn fit_sightings(sightings: &Sightings) -> Result<Self, InverseDepthError> {
+        let sightings = sightings.without_strays();
+        check(&sightings.readings())?;
+        let mut fitted = Self::default();
+        for _ in 0..ROUNDS {
+            fitted = sightings
+                .weigh(fitted.scale)
+                .ok_or(InverseDepthError::Unsure {
+                    percent: f64::INFINITY,
+                    limit: UNSURE_PERCENT,
+                })?;
+        }
+        fitted.check(&[])?;
+        let (least, most) = (sightings.per_m.min(), sightings.per_m.max());
+        let middle_per_m = (least * most).sqrt();
+        let percent = 100.0 * fitted.sigma_per_m(middle_per_m) / middle_per_m;
+        if percent > UNSURE_PERCENT {
+            return Err(InverseDepthError::Unsure {
+                percent,
+                limit: UNSURE_PERCENT,
+            });
+        }
         Ok(fitted)
     }
 
@@ -222,6 +290,75 @@ impl InverseDepth {
     }
 }
 
+impl Sightings {
+    /// As known distances, for a table.
+    #[must_use]
+    pub fn readings(&self) -> Vec<Reading> {
+        let pairs = self.per_m.iter().zip(&self.measured_per_m);
+        pairs
+            .map(|(per_m, measured_per_m)| Reading {
+                true_m: 1.0 / per_m,
+                measured_m: 1.0 / measured_per_m,
+            })
+            .collect()
+    }
+
+    /// Those whose ratio of measured to known is within [`STRAY`] sigmas (by the median deviation, and not less
+    /// than what they claim) of the median ratio.
+    #[must_use]
+    pub fn without_strays(&self) -> Self {
+        let ratios = self.measured_per_m.component_div(&self.per_m);
+        let middle = median(ratios.iter().copied());
+        let spread = 1.4826 * median(ratios.iter().map(|ratio| (ratio - middle).abs()));
+        let kept: Vec<usize> = (0..ratios.len())
+            .filter(|&k| {
+                let claimed = self.sigma_per_m[k] / self.per_m[k];
+                (ratios[k] - middle).abs() <= STRAY * spread.max(claimed)
+            })
+            .collect();
+        Self {
+            per_m: self.per_m.select_rows(&kept),
+            covariance: self.covariance.select_rows(&kept).select_columns(&kept),
+            measured_per_m: self.measured_per_m.select_rows(&kept),
+            sigma_per_m: self.sigma_per_m.select_rows(&kept),
+            alike_per_m: self.alike_per_m,
+        }
+    }
+
+    /// Scale and offset when the distances' errors enter by `scale`; `None` where they are no information.
+    fn weigh(&self, scale: f64) -> Option<InverseDepth> {
+        let count = self.per_m.len();
+        let alike = DMatrix::from_fn(count, count, |one, other| {
+            let apart = (self.per_m[one] / self.per_m[other]).ln().abs();
+            self.alike_per_m.powi(2) * (-apart / ALIKE_FACTOR.ln()).exp()
+        });
+        let own = self.sigma_per_m.component_mul(&self.sigma_per_m);
+        let covariance = &self.covariance * (scale * scale) + DMatrix::from_diagonal(&own) + alike;
+        let weights: Cholesky<f64, Dyn> = covariance.cholesky()?;
+        let ones = DVector::from_element(self.per_m.len(), 1.0);
+        let line = MatrixXx2::from_columns(&[self.per_m.clone(), ones]);
+        let weighted = weights.solve(&line);
+        let inverse: Matrix2<f64> = (line.transpose() * &weighted).try_inverse()?;
+        let found: Vector2<f64> = inverse * (weighted.transpose() * &self.measured_per_m);
+        // Where the line leaves more than was claimed, as much more is owned up to (Birge's ratio).
+        let left = &self.measured_per_m - &line * found;
+        let freedom = self.per_m.len().saturating_sub(2).max(1) as f64;
+        let widened = (left.dot(&weights.solve(&left)) / freedom).max(1.0);
+        let covariance = inverse * widened;
+        Some(InverseDepth {
+            scale: found.x,
+            offset_per_m: found.y,
+            covariance: [covariance.m11, covariance.m12, covariance.m22],
+        })
+    }
+}
+
+fn median(values: impl Iterator<Item = f64>) -> f64 {
+    let mut values: Vec<f64> = values.collect();
+    values.sort_by(f64::total_cmp);
+    values.get(values.len() / 2).copied().unwrap_or(f64::NAN)
+}
+
 const HEAD: &str = "[inverse_depth]";
 
 fn check(readings: &[Reading]) -> Result<(), InverseDepthError> {
@@ -301,6 +438,55 @@ mod tests {
                 "{true_m} m: {off} {relative}"
             );
         }
+    }
+
+    /// Sightings from 8 to 30 m of a rig whose baseline is taken 6 % too long, and whose distances are all
+    /// wrong by one factor, of sigma `alike`.
+    fn flown(seed: f64, alike: f64) -> (Sightings, f64) {
+        // Deviates of sigma 1 that need no generator: fractions of the golden ratio's multiples.
+        let deviate = |k: f64| ((k * 0.618_034 + seed * 0.414_214).fract() - 0.5) * 12_f64.sqrt();
+        let truth = DVector::from_fn(60, |k, _| 1.0 / (8.0 + 22.0 * k as f64 / 59.0));
+        let factor = alike * deviate(seed * 7.0 + 3.0);
+        let sigma_per_m = DVector::from_element(60, 0.001);
+        let measured_per_m =
+            DVector::from_fn(60, |k, _| truth[k] / 1.06 + 0.001 * deviate(k as f64));
+        let sightings = Sightings {
+            per_m: &truth * (1.0 + factor),
+            covariance: &truth * truth.transpose() * (alike * alike),
+            measured_per_m,
+            sigma_per_m,
+            alike_per_m: 0.0005,
+        };
+        (sightings, factor)
+    }
+
+    #[test]
+    fn a_wrong_baseline_is_found_from_estimated_distances_with_an_honest_sigma() {
+        for seed in 0..20 {
+            let (sightings, _) = flown(f64::from(seed), 0.01);
+            let fit = InverseDepth::fit_sightings(&sightings).unwrap();
+            let sigma = fit.covariance[0].sqrt();
+            let off = fit.scale - 1.0 / 1.06;
+            // What is wrong with all distances alike stays in the sigma however many there are.
+            assert!(sigma > 0.009, "{sigma}");
+            assert!(off.abs() < 3.0 * sigma, "{off} {sigma}");
+        }
+    }
+
+    #[test]
+    fn distances_that_are_hardly_known_make_no_correction() {
+        let (sightings, _) = flown(1.0, 0.05);
+        let refused = InverseDepth::fit_sightings(&sightings).unwrap_err();
+        assert!(refused.to_string().contains("RTK"), "{refused}");
+    }
+
+    #[test]
+    fn a_match_that_is_far_too_near_is_left_out() {
+        let (mut sightings, _) = flown(2.0, 0.01);
+        let clean = InverseDepth::fit_sightings(&sightings).unwrap();
+        sightings.measured_per_m[30] *= 3.0;
+        let fit = InverseDepth::fit_sightings(&sightings).unwrap();
+        assert!((fit.scale - clean.scale).abs() < 0.002, "{fit:?} {clean:?}");
     }
 
     #[test]

@@ -21,7 +21,7 @@ pub mod solve;
 mod tests;
 
 pub use file::RigError;
-pub use inverse_depth::{InverseDepth, InverseDepthError, Reading};
+pub use inverse_depth::{InverseDepth, InverseDepthError, Reading, Sightings};
 pub use nearest::{Checks, KeyProblem, nearest_key, toml_problem, unknown_keys};
 pub use page::{PageInput, page};
 pub use parts::{Calibrated, Mounting, RigParts, mount_angles};

@@ -1,12 +1,13 @@
 //! Sights of the marker, and the way of the airframe about each, from a recording.
 
-use super::model::{BodyAt, Sight, Start, Way};
-use crate::detect::{DetectionClass, Detector, LeftImage};
+use super::model::{BodyAt, Sight, Start, Stereo, Way};
+use crate::detect::{BoxPx, DetectionClass, Detector, LeftImage};
 use crate::ingest::{EncodedImage, ImageDecoder, Recorded, Recording, SourceError, StereoPair};
 use crate::mission::Mission;
 use crate::pose::{PoseAnswer, PoseEstimator};
+use crate::range::{Ranger, Ranging, RawPair, Target};
 use emberfix_calib::solve::{Board, Corner, find_corners};
-use emberfix_calib::{RawPixel, Rig};
+use emberfix_calib::{Eye, RawPixel, Rig};
 use emberfix_frames::{
     BootTime, ServiceTime, SignedDuration, Stamped, TimeSyncSample, Vector3, Wgs84, enu_offset,
     seconds,
@@ -106,13 +107,22 @@ pub enum Picker {
     Board(Board),
     /// A detector's best fire: the base of its box.
     Fire(Box<dyn Detector>),
+    /// A detector's best fire as stereo sees it: the middle of its flame, and how far that is.
+    Flame(Box<dyn Detector>, Box<dyn Ranger>),
+}
+
+/// What a picker found in a picture.
+struct Found {
+    pixel: RawPixel,
+    sigma_px: f64,
+    stereo: Option<Stereo>,
 }
 
 /// Sigma of a pick by hand, pixels.
 const PICK_SIGMA_PX: f64 = 1.0;
 /// Sigma of a board's middle, pixels.
 const BOARD_SIGMA_PX: f64 = 0.3;
-/// Sigma of a fire's base: pixels at least, and as a share of the box's height.
+/// Sigma of a fire's base or middle: pixels at least, and as a share of the box's height.
 const FIRE_SIGMA: (f64, f64) = (2.0, 0.1);
 /// The airframe is asked for this long before and after each stamp: what the clock may be off.
 const REACH_S: f64 = 0.6;
@@ -206,7 +216,7 @@ fn middle(board: &Board, corners: &[Corner]) -> Option<RawPixel> {
 }
 
 /// The middle of the board in a picture.
-fn middle_in(board: &Board, rig: &Rig, picture: &Picture, window: Rect) -> Option<(RawPixel, f64)> {
+fn middle_in(board: &Board, rig: &Rig, picture: &Picture, window: Rect) -> Option<Found> {
     let bgr = ImageDecoder::new(rig).left(&picture.left).ok()?;
     let part = Mat::roi(&bgr, window).ok()?;
     let mut grey = Mat::default();
@@ -217,7 +227,11 @@ fn middle_in(board: &Board, rig: &Rig, picture: &Picture, window: Rect) -> Optio
         u: middle.u + f64::from(window.x),
         v: middle.v + f64::from(window.y),
     };
-    Some((pixel, BOARD_SIGMA_PX))
+    Some(Found {
+        pixel,
+        sigma_px: BOARD_SIGMA_PX,
+        stereo: None,
+    })
 }
 
 /// Part of the picture in which the marker can be: the whole of it, unless it was surveyed. `None` when
@@ -252,8 +266,12 @@ const WINDOW_RAD: f64 = 0.157;
 /// A board is not found in less, pixels.
 const LEAST_WINDOW_PX: f64 = 40.0;
 
-/// The base of the best fire in a picture.
-fn fire_in(detector: &mut dyn Detector, rig: &Rig, picture: &Picture) -> Option<(RawPixel, f64)> {
+/// The best fire in a picture, and the picture.
+fn best_fire(
+    detector: &mut dyn Detector,
+    rig: &Rig,
+    picture: &Picture,
+) -> Option<(BoxPx, LeftImage)> {
     let image = LeftImage {
         at: picture.at,
         sequence: picture.number,
@@ -262,9 +280,60 @@ fn fire_in(detector: &mut dyn Detector, rig: &Rig, picture: &Picture) -> Option<
     };
     let found = detector.detect(&image).ok()?;
     let best = found.iter().find(|d| d.class == DetectionClass::Fire)?;
-    let (u, v) = best.box_px.base();
-    let sigma = FIRE_SIGMA.0.max(FIRE_SIGMA.1 * best.box_px.height);
-    Some((RawPixel { u, v }, sigma))
+    Some((best.box_px, image))
+}
+
+fn fire_sigma_px(fire: &BoxPx) -> f64 {
+    FIRE_SIGMA.0.max(FIRE_SIGMA.1 * fire.height)
+}
+
+/// The base of the best fire in a picture.
+fn fire_in(detector: &mut dyn Detector, rig: &Rig, picture: &Picture) -> Option<Found> {
+    let (fire, _) = best_fire(detector, rig, picture)?;
+    let (u, v) = fire.base();
+    Some(Found {
+        pixel: RawPixel { u, v },
+        sigma_px: fire_sigma_px(&fire),
+        stereo: None,
+    })
+}
+
+/// The middle of the best flame in a picture, if stereo finds it.
+fn flame_in(
+    (detector, ranger): (&mut dyn Detector, &mut dyn Ranger),
+    rig: &Rig,
+    picture: &Picture,
+) -> Option<Found> {
+    let (box_px, image) = best_fire(detector, rig, picture)?;
+    let pair = RawPair {
+        at: picture.at,
+        left_bgr: image.bgr,
+        right_gray: Some(ImageDecoder::new(rig).right(picture.right.as_ref()?).ok()?),
+    };
+    let target = Target {
+        class: DetectionClass::Fire,
+        box_px,
+    };
+    let Ok(Ranging::Measured {
+        disparity_px,
+        sigma_px,
+        centroid,
+        ..
+    }) = ranger.range(&pair, &target)
+    else {
+        return None;
+    };
+    let rectification = rig.rectification();
+    let focal_baseline = rectification.focal_px() * rig.baseline_m();
+    let corrected_per_m = (disparity_px - rectification.infinity_disparity_px()) / focal_baseline;
+    Some(Found {
+        pixel: rectification.unrectify(Eye::Left, centroid),
+        sigma_px: fire_sigma_px(&box_px),
+        stereo: Some(Stereo {
+            per_m: rig.inverse_depth().measured_per_m(corrected_per_m),
+            sigma_per_m: rig.inverse_depth().scale * sigma_px / focal_baseline,
+        }),
+    })
 }
 
 /// A picture that waits for its way, or for its turn to be looked at.
@@ -272,6 +341,7 @@ struct Picture {
     number: u64,
     at: ServiceTime,
     left: EncodedImage,
+    right: Option<EncodedImage>,
 }
 
 struct Gatherer {
@@ -366,6 +436,7 @@ impl Gatherer {
             number,
             at: pair.at,
             left: pair.value.left,
+            right: pair.value.right,
         });
     }
 
@@ -373,9 +444,15 @@ impl Gatherer {
     fn look(&mut self) {
         let ready = std::mem::take(&mut self.ready);
         let rig = Arc::clone(&self.rig);
-        let found: Vec<Option<(RawPixel, f64)>> = match &mut self.picker {
+        let found: Vec<Option<Found>> = match &mut self.picker {
             Picker::Picks(picks) => {
-                let pick = |number| Some((*picks.picks.get(&number)?, PICK_SIGMA_PX));
+                let pick = |number| {
+                    Some(Found {
+                        pixel: *picks.picks.get(&number)?,
+                        sigma_px: PICK_SIGMA_PX,
+                        stereo: None,
+                    })
+                };
                 ready
                     .iter()
                     .map(|(picture, _)| pick(picture.number))
@@ -392,15 +469,20 @@ impl Gatherer {
                 .iter()
                 .map(|(picture, _)| fire_in(detector.as_mut(), &rig, picture))
                 .collect(),
+            Picker::Flame(detector, ranger) => ready
+                .iter()
+                .map(|(picture, _)| flame_in((detector.as_mut(), ranger.as_mut()), &rig, picture))
+                .collect(),
         };
         for ((picture, way), found) in ready.into_iter().zip(found) {
-            if let Some((pixel, sigma_px)) = found {
+            if let Some(found) = found {
                 self.gathered.seen += 1;
                 self.gathered.sights.push(Sight {
                     at: picture.at,
-                    pixel,
-                    sigma_px,
+                    pixel: found.pixel,
+                    sigma_px: found.sigma_px,
                     way,
+                    stereo: found.stereo,
                 });
             }
         }
@@ -426,17 +508,19 @@ impl Gatherer {
 
     fn way(&self, moment: ServiceTime) -> Option<Way> {
         let steps = (REACH_S / STEP_S).round() as i32;
-        let bodies = (-steps..=steps).map(|step| {
+        let pose = |step| {
             let then = moment + seconds(f64::from(step) * STEP_S);
             match self.poses.at(then, self.now) {
-                PoseAnswer::Fresh(pose) => Some(BodyAt::new(&pose, &self.datum)),
+                PoseAnswer::Fresh(pose) => Some(pose),
                 _ => None,
             }
-        });
+        };
+        let body = |step| Some(BodyAt::new(pose(step)?.as_ref(), &self.datum));
         Some(Way {
             from_s: -f64::from(steps) * STEP_S,
             step_s: STEP_S,
-            bodies: bodies.collect::<Option<Vec<_>>>()?,
+            time_sigma_s: pose(0)?.time_sigma_s,
+            bodies: (-steps..=steps).map(body).collect::<Option<Vec<_>>>()?,
         })
     }
 

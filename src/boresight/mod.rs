@@ -28,7 +28,7 @@ mod words;
 
 pub use flight::{Gathered, Marker, Picker, Picks, PicksError, gather};
 pub(crate) use model::mount_of;
-pub use model::{BodyAt, Parameter, Sight, Start, Way};
-pub use solve::{Solution, SolveError, solve};
+pub use model::{BodyAt, Parameter, Sight, Start, Stereo, Way};
+pub use solve::{Ranges, Solution, SolveError, solve};
 pub use wander::Wandering;
 pub use words::observability;

@@ -79,6 +79,8 @@ pub struct Way {
     pub from_s: f64,
     /// Seconds between steps.
     pub step_s: f64,
+    /// One sigma of the autopilot's clock against ours, seconds: the same in all pictures.
+    pub time_sigma_s: f64,
     /// The steps.
     pub bodies: Vec<BodyAt>,
 }
@@ -132,6 +134,17 @@ pub struct Sight {
     pub sigma_px: f64,
     /// The airframe about that moment (the rig file's clock offset is in it already).
     pub way: Way,
+    /// How far stereo says that it is, where somebody asked.
+    pub stereo: Option<Stereo>,
+}
+
+/// Inverse depth along the rectified boresight by stereo alone, without the rig's correction.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Stereo {
+    /// 1/m.
+    pub per_m: f64,
+    /// One sigma, 1/m.
+    pub sigma_per_m: f64,
 }
 
 /// What is known before the flight is looked at.
@@ -141,6 +154,8 @@ pub struct Start {
     pub camera: Camera,
     /// Takes left-camera components to body components, by the rig file.
     pub body_from_camera: Matrix3<f64>,
+    /// Takes raw left-camera components to those of the rectified left camera.
+    pub rectified_from_raw: Matrix3<f64>,
     /// Lever arm by the rig file, metres.
     pub arm_m: Vector3<f64>,
     /// Where the marker is, if it was surveyed, metres in the plane at the datum.
@@ -171,11 +186,25 @@ impl Start {
         Self {
             camera: rig.camera(Eye::Left).clone(),
             body_from_camera: rotation_matrix(&body_from_camera::<CamLeftRaw>(rig.mount())),
+            rectified_from_raw: *rig.rectification().rectified_from_raw(Eye::Left),
             arm_m: arm_of(rig),
             marker_m: marker.map(|marker| marker.enu_m(&mission.datum)),
             sigmas,
             wandering: slow,
         }
+    }
+
+    /// The same, for a rig whose mount and clock were calibrated: they are as good as its file says.
+    #[must_use]
+    pub fn of_calibrated(mission: &Mission, marker: Option<Marker>) -> Self {
+        let mut start = Self::of(mission, marker);
+        let known = mission.rig.sigmas();
+        start
+            .sigmas
+            .fixed_rows_mut::<3>(Parameter::MountRoll as usize)
+            .fill(known.boresight_rad);
+        start.sigmas[Parameter::Clock as usize] = known.time_offset_s;
+        start
     }
 
     /// Where the surveyed marker should be seen if the rig file were right and the clock off by
@@ -229,7 +258,7 @@ pub(super) fn part(x: &Parameters, first: Parameter) -> Vector3<f64> {
 /// Everything that does not change from picture to picture, made from one set of parameters.
 #[derive(Debug, Clone)]
 pub(super) struct Model<'a> {
-    camera: &'a Camera,
+    start: &'a Start,
     clock_s: f64,
     /// True attitude from the reported one. Reported minus true is turned back: heading against the
     /// clock, seen from above.
@@ -248,7 +277,7 @@ impl<'a> Model<'a> {
         let untilt = UnitQuaternion::from_scaled_axis(-Vector3::new(x[tilt], x[tilt + 1], 0.0));
         let mount = UnitQuaternion::from_scaled_axis(part(x, Parameter::MountRoll));
         Self {
-            camera: &start.camera,
+            start,
             clock_s: x[Parameter::Clock as usize],
             true_from_reported: heading * untilt,
             body_from_camera: mount.to_rotation_matrix().into_inner() * start.body_from_camera,
@@ -258,14 +287,25 @@ impl<'a> Model<'a> {
         }
     }
 
-    /// Where the marker should be seen; `None` behind the camera.
-    pub fn predict(&self, way: &Way) -> Option<RawPixel> {
+    /// The marker in raw left-camera components, metres; `None` behind the camera.
+    fn seen_m(&self, way: &Way) -> Option<Vector3<f64>> {
         let body = way.at(self.clock_s)?;
         let enu_from_body = self.true_from_reported * body.enu_from_body;
         let from_body = self.marker_m - (body.position_m - self.gnss_m);
         let in_body = enu_from_body.inverse_transform_vector(&from_body) - self.arm_m;
         let seen = self.body_from_camera.tr_mul(&in_body);
-        (seen.z > 0.05 * seen.norm()).then(|| self.camera.project(&seen))
+        (seen.z > 0.05 * seen.norm()).then_some(seen)
+    }
+
+    /// Where the marker should be seen; `None` behind the camera.
+    pub fn predict(&self, way: &Way) -> Option<RawPixel> {
+        Some(self.start.camera.project(&self.seen_m(way)?))
+    }
+
+    /// The marker's inverse depth along the rectified boresight, 1/m; `None` behind the camera.
+    pub fn per_m(&self, way: &Way) -> Option<f64> {
+        let depth_m = (self.start.rectified_from_raw * self.seen_m(way)?).z;
+        (depth_m > 0.0).then(|| 1.0 / depth_m)
     }
 }
 

@@ -1,9 +1,9 @@
 //! The batch: Gauss-Newton, damped, robust.
 
-use super::model::{Model, N, Parameter, Parameters, Sight, Start, mount_of, part};
+use super::model::{Model, N, Parameter, Parameters, Sight, Start, Stereo, mount_of, part};
 use super::wander::{Prior, Unknowns};
 use emberfix_frames::{MountAngles, UnitQuaternion, Vector3};
-use nalgebra::{DMatrix, Matrix3, SMatrix, SVector};
+use nalgebra::{DMatrix, DVector, Matrix3, SMatrix, SVector};
 
 type Normal = DMatrix<f64>;
 type Residual = SVector<f64, 2>;
@@ -62,8 +62,22 @@ pub struct Solution {
     pub rate_rad_s: f64,
     /// Whether the marker was surveyed.
     pub surveyed: bool,
+    /// How far the marker was where stereo measured it.
+    pub ranges: Ranges,
 }
 
+/// Inverse depths of the marker along the rectified boresight, by all that was seen of it but stereo.
+#[derive(Debug, Clone)]
+pub struct Ranges {
+    /// 1/m, of each sight with [`Stereo`] that agrees with the rest.
+    pub per_m: DVector<f64>,
+    /// Their covariance, 1/m²: what is wrong with one is mostly wrong with all.
+    pub covariance: DMatrix<f64>,
+    /// What stereo said of each.
+    pub stereo: Vec<Stereo>,
+}
+
+const CLOCK: usize = Parameter::Clock as usize;
 /// Fewest pictures.
 const LEAST: usize = 8;
 /// Clock offsets from which the search starts, seconds.
@@ -350,12 +364,13 @@ impl Batch<'_> {
             surveyed: self.start.marker_m.is_some(),
             before: self.start.sigmas,
             parameters: x,
-            covariance,
+            ranges: self.ranges(found, &kept, &covariance),
+            covariance: covariance.fixed_view::<N, N>(0, 0).into_owned(),
         })
     }
 
-    /// Of the parameters: what was measured, at its own scale and widened, and what was known beforehand.
-    fn covariance(&self, found: &Found, widened: f64) -> Option<SMatrix<f64, N, N>> {
+    /// Of all unknowns: what was measured, at its own scale and widened, and what was known beforehand.
+    fn covariance(&self, found: &Found, widened: f64) -> Option<Normal> {
         let (normal, _) = self.linearise(&found.x, &found.residuals, found.scale);
         let prior = self.prior.information();
         let weight = found.scale * found.scale;
@@ -363,11 +378,44 @@ impl Batch<'_> {
         // Scaled by what was known, so that radians and metres of kilometres do not spoil the inverse.
         let units = Normal::from_diagonal(self.prior.sigmas());
         let inverse = (&units * (measured + prior) * &units).cholesky()?.inverse();
-        Some(
-            (&units * inverse * &units)
-                .fixed_view::<N, N>(0, 0)
-                .into_owned(),
-        )
+        Some(&units * inverse * &units)
+    }
+
+    fn ranges(&self, found: &Found, kept: &[usize], covariance: &Normal) -> Ranges {
+        let sights = || kept.iter().map(|sight| &self.sights[*sight]);
+        let known: Vec<(Stereo, f64, DVector<f64>)> = sights()
+            .filter_map(|sight| {
+                let (per_m, by) = self.inverse_depth(&found.x, sight)?;
+                Some((sight.stereo?, per_m, by))
+            })
+            .collect();
+        let by = DMatrix::from_fn(known.len(), found.x.len(), |row, column| {
+            known[row].2[column]
+        });
+        Ranges {
+            per_m: DVector::from_iterator(known.len(), known.iter().map(|(_, per_m, _)| *per_m)),
+            covariance: &by * covariance * by.transpose(),
+            stereo: known.iter().map(|(stereo, ..)| *stereo).collect(),
+        }
+    }
+
+    /// The marker's inverse depth at a sight, and its derivative over the unknowns.
+    fn inverse_depth(&self, x: &Unknowns, sight: &Sight) -> Option<(f64, DVector<f64>)> {
+        let moment = self.prior.moment(x, sight.at);
+        let per_m = Model::new(self.start, &moment).per_m(&sight.way)?;
+        let mut by = SMatrix::<f64, 1, N>::zeros();
+        for index in 0..N {
+            let step = step_of(index);
+            let mut there = moment;
+            there[index] += step;
+            by[index] = (Model::new(self.start, &there).per_m(&sight.way)? - per_m) / step;
+        }
+        let (by, places) = self.prior.spread(&by, sight.at);
+        let mut all = DVector::zeros(x.len());
+        for (place, value) in places.iter().zip(by.iter()) {
+            all[*place] += value;
+        }
+        Some((per_m, all))
     }
 
     fn mount(&self, x: &Parameters) -> MountAngles {
@@ -407,7 +455,6 @@ fn cauchy_weight(length: f64, scale: f64) -> f64 {
 
 /// Step of the numerical derivative: far above rounding, far below what matters.
 fn step_of(index: usize) -> f64 {
-    const CLOCK: usize = Parameter::Clock as usize;
     match index {
         CLOCK => 1e-4,
         0..3 | 7..10 => 1e-7,

@@ -74,6 +74,7 @@ fn start(surveyed: bool) -> Start {
     Start {
         camera: rig.camera(Eye::Left).clone(),
         body_from_camera: rotation_matrix(&body_from_camera::<CamLeftRaw>(rig.mount())),
+        rectified_from_raw: *rig.rectification().rectified_from_raw(Eye::Left),
         arm_m: Vector3::zeros(),
         marker_m: surveyed.then(Vector3::zeros),
         sigmas,
@@ -108,6 +109,7 @@ fn fly(path: Path, seed: u64, sigma_px: f64) -> Vec<Sight> {
         let way = Way {
             from_s: -0.6,
             step_s: 0.02,
+            time_sigma_s: 0.0,
             bodies: (0..61)
                 .map(|step| body(path(t_s - 0.6 + 0.02 * f64::from(step))))
                 .collect(),
@@ -117,6 +119,7 @@ fn fly(path: Path, seed: u64, sigma_px: f64) -> Vec<Sight> {
             pixel: emberfix_calib::RawPixel { u: 0.0, v: 0.0 },
             sigma_px,
             way,
+            stereo: None,
         };
         let seen = Model::new(&begin, &truth()).predict(&sight.way)?;
         let inside = (0.0..1280.0).contains(&seen.u) && (0.0..720.0).contains(&seen.v);

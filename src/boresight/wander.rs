@@ -150,13 +150,13 @@ impl Prior {
 
     /// Derivatives over the unknowns that a sight at a moment touches, from those over the parameters at
     /// that moment; and which unknowns these are.
-    pub fn spread(
+    pub fn spread<const ROWS: usize>(
         &self,
-        by: &SMatrix<f64, 2, N>,
+        by: &SMatrix<f64, ROWS, N>,
         at: ServiceTime,
-    ) -> (SMatrix<f64, 2, TOUCHED>, [usize; TOUCHED]) {
+    ) -> (SMatrix<f64, ROWS, TOUCHED>, [usize; TOUCHED]) {
         let (knot, share) = self.place(at);
-        let mut all = SMatrix::<f64, 2, TOUCHED>::zeros();
+        let mut all = SMatrix::<f64, ROWS, TOUCHED>::zeros();
         all.fixed_columns_mut::<N>(0).copy_from(by);
         let wandering = by.fixed_columns::<WANDERING>(FIRST);
         all.fixed_columns_mut::<WANDERING>(N)

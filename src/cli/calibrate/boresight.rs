@@ -5,13 +5,14 @@ use crate::boresight::{
     solve,
 };
 use crate::cli::Failure;
-use crate::detect::{self, BoxFileDetector};
+use crate::detect::{self, BoxFileDetector, Detector};
+use crate::ingest::SourceError;
 use crate::mission::Mission;
 use emberfix_calib::solve::Board;
 use emberfix_frames::{EllipsoidHeight, place_from_degrees};
 use emberfix_report::Figure;
 use serde_json::{Value, json};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// How the camera sits on the airframe and how late its clock is, from a flight past a fixed point.
 #[derive(Debug, clap::Args)]
@@ -20,13 +21,8 @@ pub struct BoresightArguments {
     recording: PathBuf,
     /// Mission file, such as missions/marker.toml; its rig is where the search starts.
     mission: PathBuf,
-    /// The marker's surveyed place: degrees, degrees, metres above the ellipsoid. Without it: any fixed
-    /// point, and what remains unknown is said.
-    #[arg(long, value_name = "LAT,LON,H", allow_hyphen_values = true, value_parser = place)]
-    marker: Option<[f64; 3]>,
-    /// One sigma of the survey, metres.
-    #[arg(long, value_name = "M", default_value_t = 0.02, value_parser = survey)]
-    marker_sigma: f64,
+    #[command(flatten)]
+    marker: MarkerArguments,
     /// The marker's pixels, picked by hand: lines of PAIR,COLUMN,ROW.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["board", "boxes"])]
     picks: Option<PathBuf>,
@@ -42,6 +38,33 @@ pub struct BoresightArguments {
     /// Print one JSON object instead of the table.
     #[arg(long)]
     json: bool,
+}
+
+/// Where a marker is.
+#[derive(Debug, clap::Args)]
+pub(super) struct MarkerArguments {
+    /// The marker's surveyed place: degrees, degrees, metres above the ellipsoid. Without it: any fixed
+    /// point, and what remains unknown is said.
+    #[arg(long, value_name = "LAT,LON,H", allow_hyphen_values = true, value_parser = place)]
+    marker: Option<[f64; 3]>,
+    /// One sigma of the survey, metres.
+    #[arg(long, value_name = "M", default_value_t = 0.02, value_parser = survey)]
+    marker_sigma: f64,
+}
+
+impl MarkerArguments {
+    /// The marker, if it was surveyed.
+    pub(super) fn marker(&self) -> Result<Option<Marker>, Failure> {
+        let Some([latitude, longitude, height]) = self.marker else {
+            return Ok(None);
+        };
+        let height = EllipsoidHeight::from_m(height);
+        let place = place_from_degrees(latitude, longitude, height).map_err(Failure::refused)?;
+        Ok(Some(Marker {
+            place,
+            sigma_m: self.marker_sigma,
+        }))
+    }
 }
 
 fn place(text: &str) -> Result<[f64; 3], String> {
@@ -64,17 +87,7 @@ fn survey(text: &str) -> Result<f64, String> {
 /// Gathers, solves, shows, writes.
 pub fn boresight(arguments: &BoresightArguments) -> Result<(), Failure> {
     let mission = Mission::load(&arguments.mission).map_err(Failure::refused)?;
-    let marker = arguments
-        .marker
-        .map(|[latitude, longitude, height]| {
-            let height = EllipsoidHeight::from_m(height);
-            place_from_degrees(latitude, longitude, height).map(|place| Marker {
-                place,
-                sigma_m: arguments.marker_sigma,
-            })
-        })
-        .transpose()
-        .map_err(Failure::refused)?;
+    let marker = arguments.marker.marker()?;
     let start = Start::of(&mission, marker);
     let gathered = read(arguments, &mission, &start)?;
     let solution = solve(&start, &gathered.sights).map_err(Failure::failed)?;
@@ -98,13 +111,18 @@ fn read(
     start: &Start,
 ) -> Result<Gathered, Failure> {
     let picker = picker(arguments, mission)?;
+    with_spinner(|progress| gather(&arguments.recording, mission, start, picker, progress))
+}
+
+/// Gathers, and shows how many pairs there were so far.
+pub(super) fn with_spinner(
+    gather: impl FnOnce(&mut dyn FnMut(u64)) -> Result<Gathered, SourceError>,
+) -> Result<Gathered, Failure> {
     let bar = indicatif::ProgressBar::new_spinner();
     if let Ok(style) = indicatif::ProgressStyle::with_template("{spinner} {pos} pairs, {elapsed}") {
         bar.set_style(style);
     }
-    let gathered = gather(&arguments.recording, mission, start, picker, &mut |pairs| {
-        bar.set_position(pairs);
-    });
+    let gathered = gather(&mut |pairs| bar.set_position(pairs));
     bar.finish_and_clear();
     gathered.map_err(|error| {
         if error.is_refusal() {
@@ -116,21 +134,27 @@ fn read(
 }
 
 fn picker(arguments: &BoresightArguments, mission: &Mission) -> Result<Picker, Failure> {
-    Ok(
-        match (&arguments.picks, &arguments.board, &arguments.boxes) {
-            (Some(path), _, _) => Picker::Picks(Picks::load(path).map_err(Failure::refused)?),
-            // Squares of any size have the same middle; markers fill about three quarters of theirs.
-            (_, Some(board), _) => {
-                Picker::Board(Board::parse(board, 0.1, Some(0.075)).map_err(Failure::refused)?)
-            }
-            (_, _, Some(path)) => fire(BoxFileDetector::load(path).map_err(Failure::refused)?),
-            _ => Picker::Fire(detect::open(&mission.detector).map_err(Failure::refused)?),
-        },
-    )
+    Ok(match (&arguments.picks, &arguments.board) {
+        (Some(path), _) => Picker::Picks(Picks::load(path).map_err(Failure::refused)?),
+        // Squares of any size have the same middle; markers fill about three quarters of theirs.
+        (_, Some(board)) => {
+            Picker::Board(Board::parse(board, 0.1, Some(0.075)).map_err(Failure::refused)?)
+        }
+        _ => Picker::Fire(detector_of(arguments.boxes.as_deref(), mission)?),
+    })
 }
 
-fn fire(detector: BoxFileDetector) -> Picker {
-    Picker::Fire(Box::new(detector))
+/// Boxes from a file, or the mission's model.
+pub(super) fn detector_of(
+    boxes: Option<&Path>,
+    mission: &Mission,
+) -> Result<Box<dyn Detector>, Failure> {
+    match boxes {
+        Some(path) => Ok(Box::new(
+            BoxFileDetector::load(path).map_err(Failure::refused)?,
+        )),
+        None => detect::open(&mission.detector).map_err(Failure::refused),
+    }
 }
 
 /// A row: what it is, by the rig file, found, one sigma; a number of the parameter vector.

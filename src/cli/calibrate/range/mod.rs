@@ -1,40 +1,92 @@
 //! `emberfix calibrate range`.
 
+mod flight;
+
 use crate::cli::Failure;
 use anyhow::{Context, bail};
 use emberfix_calib::{InverseDepth, Reading, Rig};
+use flight::FlightArguments;
+use serde_json::json;
 use std::path::{Path, PathBuf};
 
-/// Scale and offset of inverse depth, from known distances.
+/// Scale and offset of inverse depth, from known distances or from a flight past a fire.
 #[derive(Debug, clap::Args)]
 pub struct RangeArguments {
-    /// Tables with a header: true_m (along the boresight) and measured_m or disparity_px.
-    #[arg(required = true)]
-    tables: Vec<PathBuf>,
-    /// Rig file that the readings were made with; the correction is written into it.
-    rig: PathBuf,
+    /// Tables with a header: true_m (along the boresight) and measured_m or disparity_px; last the rig file
+    /// that the readings were made with, into which the correction is written.
+    #[arg(
+        value_name = "TABLE... RIG",
+        required_unless_present = "flight",
+        conflicts_with = "flight",
+        num_args = 2..
+    )]
+    files: Vec<PathBuf>,
+    #[command(flatten)]
+    flight: FlightArguments,
     /// Only show the correction; write nothing.
     #[arg(long)]
     dry_run: bool,
+    /// Print one JSON object instead of the table.
+    #[arg(long)]
+    json: bool,
+}
+
+/// What was measured at which distance, what that makes of the rig, and the rig's file.
+struct Fitted {
+    readings: Vec<Reading>,
+    correction: InverseDepth,
+    rig: PathBuf,
 }
 
 /// Fits, shows, writes.
 pub fn range(arguments: &RangeArguments) -> Result<(), Failure> {
-    let rig = Rig::load(&arguments.rig).map_err(Failure::refused)?;
-    let readings = arguments
-        .tables
+    let fitted = match (&arguments.flight.flight, arguments.files.split_last()) {
+        (Some(recording), _) => flight::fit(recording, &arguments.flight)?,
+        (None, Some((rig, tables))) => fit_tables(tables, rig)?,
+        (None, None) => return Err(Failure::Refused(anyhow::anyhow!("no tables, no flight"))),
+    };
+    if arguments.json {
+        println!("{:#}", as_json(&fitted));
+    } else {
+        show(&fitted.readings, &fitted.correction);
+    }
+    if !arguments.dry_run {
+        write(&fitted.rig, &fitted.correction).map_err(Failure::Failed)?;
+        eprintln!("written to {}", fitted.rig.display());
+    }
+    Ok(())
+}
+
+fn fit_tables(tables: &[PathBuf], path: &Path) -> Result<Fitted, Failure> {
+    let rig = Rig::load(path).map_err(Failure::refused)?;
+    let readings = tables
         .iter()
         .map(|table| readings(table, &rig))
         .collect::<anyhow::Result<Vec<_>>>()
         .map_err(Failure::Refused)?
         .concat();
     let correction = InverseDepth::fit(&readings).map_err(Failure::refused)?;
-    show(&readings, &correction);
-    if !arguments.dry_run {
-        write(&arguments.rig, &correction).map_err(Failure::Failed)?;
-        println!("written to {}", arguments.rig.display());
-    }
-    Ok(())
+    Ok(Fitted {
+        readings,
+        correction,
+        rig: path.to_owned(),
+    })
+}
+
+fn as_json(fitted: &Fitted) -> serde_json::Value {
+    let reading = |reading: &Reading| {
+        json!({
+            "true_m": reading.true_m,
+            "measured_m": reading.measured_m,
+            "corrected_m": 1.0 / fitted.correction.corrected_per_m(1.0 / reading.measured_m),
+        })
+    };
+    json!({
+        "scale": fitted.correction.scale,
+        "offset_per_m": fitted.correction.offset_per_m,
+        "covariance": fitted.correction.covariance,
+        "readings": fitted.readings.iter().map(reading).collect::<Vec<_>>(),
+    })
 }
 
 /// All readings of a table, as they would be without the correction that the rig file may have already.
