@@ -303,7 +303,7 @@ impl Sightings {
             .collect()
     }
 
-    /// Those whose ratio of measured to known is within [`STRAY`] sigmas (by the median deviation, and not less
+    /// Those whose ratio of measured to known is within five sigmas (by the median deviation, and not less
     /// than what they claim) of the median ratio.
     #[must_use]
     pub fn without_strays(&self) -> Self {
