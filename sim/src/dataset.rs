@@ -376,7 +376,8 @@ fn cropped(rng: &mut ChaCha8Rng, frame: &Frame, boxes: &[LabelBox]) -> (Frame, W
 /// Half side of the square in which things stand, metres.
 const FIELD_M: f64 = 45.0;
 
-fn random_world(rng: &mut ChaCha8Rng) -> WorldConfig {
+/// A world such as the pictures are taken in.
+pub fn random_world(rng: &mut ChaCha8Rng) -> WorldConfig {
     let fires = if rng.random_bool(0.72) {
         rng.random_range(1..=5)
     } else {
@@ -457,8 +458,8 @@ fn random_light(rng: &mut ChaCha8Rng) -> LightConfig {
     }
 }
 
-fn random_exposure(rng: &mut ChaCha8Rng, light: &LightConfig) -> RenderConfig {
-    // What an automatic exposure would choose, and how far it is off.
+/// What an automatic exposure would choose in this light, and how far it is off.
+pub fn random_exposure(rng: &mut ChaCha8Rng, light: &LightConfig) -> RenderConfig {
     let scene = 0.7 * light.sun + 0.45 * light.ambience;
     RenderConfig {
         seed: rng.random(),
@@ -497,17 +498,11 @@ fn random_smoke(rng: &mut ChaCha8Rng, k: u32) -> SmokeConfig {
 }
 
 fn random_lookalike(rng: &mut ChaCha8Rng) -> LookalikeConfig {
-    let kind = match rng.random_range(0..4) {
-        0 => LookalikeKind::RedRoof,
-        1 => LookalikeKind::SunGlint,
-        2 => LookalikeKind::OrangeVehicle,
-        _ => LookalikeKind::Lantern,
-    };
-    let size_m = match kind {
-        LookalikeKind::RedRoof => rng.random_range(5.0..14.0),
-        LookalikeKind::SunGlint => rng.random_range(0.6..6.0),
-        LookalikeKind::OrangeVehicle => rng.random_range(2.5..7.0),
-        LookalikeKind::Lantern => rng.random_range(0.1..0.5),
+    let (kind, size_m) = match rng.random_range(0..4) {
+        0 => (LookalikeKind::RedRoof, rng.random_range(5.0..14.0)),
+        1 => (LookalikeKind::SunGlint, rng.random_range(0.6..6.0)),
+        2 => (LookalikeKind::OrangeVehicle, rng.random_range(2.5..7.0)),
+        _ => (LookalikeKind::Lantern, rng.random_range(0.1..0.5)),
     };
     let place = random_place(rng);
     LookalikeConfig {

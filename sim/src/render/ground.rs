@@ -79,6 +79,7 @@ pub(super) struct Ground<'a> {
     marks: &'a MarkGrid,
     glows: Vec<Glow>,
     sunlight: Rgb,
+    left_by_air: Rgb,
     skylight: Rgb,
     /// The eye's place within each texture's tile, metres.
     origins: Origins,
@@ -124,6 +125,20 @@ struct Levels<'a> {
     fine: Option<Lod<'a>>,
 }
 
+/// Direct light of a clear noon: red, green, blue, near infrared.
+const NOON: Rgb = [2.3, 2.15, 1.9, 2.15];
+/// What one more vertical air mass takes away; blue goes first.
+const LOST: Rgb = [0.02, 0.05, 0.12, 0.01];
+/// From here down the sun reddens, degrees; above, what the air takes is in the noon's colours.
+const LOW_SUN_DEG: f64 = 12.0;
+
+/// Share of the direct light that a low sun's longer way through the air leaves.
+fn left_by_air(sun_elevation_deg: f64) -> Rgb {
+    let air_mass = |deg: f64| 1.0 / deg.max(2.0).to_radians().sin();
+    let more = (air_mass(sun_elevation_deg) - air_mass(LOW_SUN_DEG)).max(0.0) as f32;
+    LOST.map(|lost| (-lost * more).exp())
+}
+
 impl<'a> Ground<'a> {
     pub(super) fn new(
         world: &'a World,
@@ -134,6 +149,7 @@ impl<'a> Ground<'a> {
     ) -> Self {
         let light = world.light();
         let (sun, sky) = (light.sun as f32, light.ambience as f32);
+        let left = left_by_air(light.sun_elevation_deg);
         let at = (pose.origin_m.x, pose.origin_m.y);
         let textures = world.textures();
         let origin = |texture: &Texture| texture.origin(at);
@@ -145,7 +161,8 @@ impl<'a> Ground<'a> {
             nodes: Vec::new(),
             marks,
             glows: world.glows(t_s),
-            sunlight: [2.3, 2.15, 1.9, 2.15].map(|c| c * sun),
+            sunlight: std::array::from_fn(|c| NOON[c] * left[c] * sun),
+            left_by_air: left,
             skylight: [0.50, 0.56, 0.66, 0.56].map(|c| c * sky),
             origins: Origins {
                 fine: origin(&textures.fine),
@@ -417,7 +434,8 @@ impl<'a> Ground<'a> {
             (ray[0] * self.sun.x as f32 + ray[1] * self.sun.y as f32 + ray[2] * self.sun.z as f32)
                 / length;
         let glare = clear * (towards.max(0.0).powi(64) * 0.8 + towards.max(0.0).powi(4096) * 60.0);
-        std::array::from_fn(|c| colour[c] + glare * [1.0, 0.93, 0.8, 0.93][c])
+        let glare_of = |c: usize| [1.0, 0.93, 0.8, 0.93][c] * self.left_by_air[c];
+        std::array::from_fn(|c| colour[c] + glare * glare_of(c))
     }
 
     /// Light on a surface with this normal (east, north, up) and albedo.

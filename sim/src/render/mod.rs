@@ -199,7 +199,7 @@ impl Renderer {
             .flat_map(|burning| burning.splats);
         let glints = things.glints.iter().filter(move |_| bright);
         let glints = glints.flat_map(move |glint| glint.splats(&pose.origin_m, &sun, t_s));
-        burning.chain(glints).chain(things.lights.iter().copied())
+        burning.chain(glints).chain(things.clouds.iter().copied())
     }
 
     fn draw_splats(&self, band: &mut Band, splats: &[SeenSplat]) {

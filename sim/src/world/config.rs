@@ -190,6 +190,10 @@ pub enum LookalikeKind {
     OrangeVehicle,
     /// A steady orange lamp.
     Lantern,
+    /// A dark car with its headlamps on.
+    Headlamps,
+    /// A bank of white fog.
+    Fog,
 }
 
 /// A chessboard that lies level on the ground, with a white margin of one square.

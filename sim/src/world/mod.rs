@@ -28,6 +28,7 @@ pub(crate) use burning::{Flame, Plume, Splat, SplatKind, unit};
 pub(crate) use terrain::Terrain;
 pub(crate) use texture::{Lod, Rgb, Texture, Textures, UNIT, hash, mix};
 pub(crate) use things::{Ball, Mark, MarkKind, Quad, Things};
+use things::{DARK, signal_orange};
 
 use nalgebra::{Vector2, Vector3};
 use rand::{Rng, SeedableRng};
@@ -352,6 +353,12 @@ impl World {
         [0.99 * grey, grey, 1.04 * grey]
     }
 
+    /// White, in today's light.
+    fn fog_colour(&self) -> [f32; 3] {
+        let day = 0.35 + 0.35 * self.light.sun as f32 + 0.3 * self.light.ambience as f32;
+        [0.70, 0.71, 0.73].map(|c| c * day)
+    }
+
     fn fire_seed(&self, fire: usize) -> u64 {
         hash(self.seed, fire as u32, 0xF1)
     }
@@ -369,9 +376,20 @@ impl World {
                 LookalikeKind::RedRoof => self.things.add_house(foot, thing.size_m, seed, &sun),
                 LookalikeKind::SunGlint => self.things.add_puddle(foot, thing.size_m, seed),
                 LookalikeKind::OrangeVehicle => {
-                    self.things.add_vehicle(foot, thing.size_m, seed, &sun);
+                    let paint = signal_orange(seed);
+                    self.things
+                        .add_vehicle(foot, thing.size_m, seed, paint, &sun);
                 }
                 LookalikeKind::Lantern => self.things.add_lantern(foot, thing.size_m),
+                LookalikeKind::Headlamps => {
+                    self.things
+                        .add_vehicle(foot, thing.size_m, seed, DARK, &sun);
+                    self.things.add_headlamps(foot, thing.size_m, seed);
+                }
+                LookalikeKind::Fog => {
+                    let colour = self.fog_colour();
+                    self.things.add_fog(foot, thing.size_m, seed, colour);
+                }
             }
         }
     }

@@ -106,8 +106,16 @@ pub(crate) struct Things {
     pub quads: Vec<Quad>,
     pub marks: Vec<Mark>,
     pub glints: Vec<Glint>,
-    /// Lamps.
-    pub lights: Vec<Splat>,
+    /// Lamps and fog.
+    pub clouds: Vec<Splat>,
+}
+
+/// Paint of a car that should not be seen for its colour.
+pub(crate) const DARK: [f32; 3] = [0.04, 0.04, 0.05];
+
+/// Paint of a car that looks like fire.
+pub(crate) fn signal_orange(seed: u64) -> [f32; 3] {
+    [0.80, 0.20 + 0.1 * unit(seed, 0, 32) as f32, 0.025]
 }
 
 impl Things {
@@ -196,16 +204,16 @@ impl Things {
         self.add_shadow(foot, walls, 0.7 * size_m, sun);
     }
 
-    /// A car in signal orange.
+    /// A car.
     pub(crate) fn add_vehicle(
         &mut self,
         foot: Vector3<f64>,
         size_m: f64,
         seed: u64,
+        paint: [f32; 3],
         sun: &Vector3<f64>,
     ) {
         let (along, across) = turned(seed, size_m, 0.42 * size_m);
-        let paint = [0.80, 0.20 + 0.1 * unit(seed, 0, 32) as f32, 0.025];
         let (body, cabin) = (0.19 * size_m, 0.13 * size_m);
         self.add_box(
             foot + Vector3::z() * (0.05 * size_m),
@@ -306,9 +314,47 @@ impl Things {
             opacity: 0.0,
             billow: (0.0, 0.0),
         };
-        self.lights.push(lamp(0.6 * size_m, [2.2, 0.95, 0.16]));
-        self.lights.push(lamp(1.6 * size_m, [0.22, 0.09, 0.015]));
+        self.clouds.push(lamp(0.6 * size_m, [2.2, 0.95, 0.16]));
+        self.clouds.push(lamp(1.6 * size_m, [0.22, 0.09, 0.015]));
         self.add_trunk(foot, 1.2 * size_m, 0.08 * size_m);
+    }
+
+    /// Two white lamps at the front of a car, and the haze that they light up.
+    pub(crate) fn add_headlamps(&mut self, foot: Vector3<f64>, size_m: f64, seed: u64) {
+        let (along, across) = turned(seed, size_m, 0.42 * size_m);
+        let bumper = foot + along * 0.52 + Vector3::z() * (0.15 * size_m);
+        for side in [-0.36, 0.36] {
+            let lamp = |half: f64, colour: [f32; 3]| Splat {
+                kind: SplatKind::Light,
+                centre_m: bumper + across * side,
+                half_axis_m: Vector3::z() * half,
+                half_width_m: half,
+                colour,
+                opacity: 0.0,
+                billow: (0.0, 0.0),
+            };
+            self.clouds.push(lamp(0.03 * size_m, [6.0, 5.4, 4.2]));
+            self.clouds.push(lamp(0.11 * size_m, [0.5, 0.44, 0.33]));
+        }
+    }
+
+    /// A low bank of fog: soft, flat, white.
+    pub(crate) fn add_fog(&mut self, foot: Vector3<f64>, size_m: f64, seed: u64, colour: [f32; 3]) {
+        for k in 0..24 {
+            let (sin, cos) = (TAU * unit(seed, k, 1)).sin_cos();
+            let out = 0.5 * size_m * unit(seed, k, 2).sqrt();
+            let half = size_m * (0.09 + 0.08 * unit(seed, k, 3));
+            let up = half * (0.6 + 0.6 * unit(seed, k, 4));
+            self.clouds.push(Splat {
+                kind: SplatKind::Smoke,
+                centre_m: foot + Vector3::new(out * cos, 0.6 * out * sin, up),
+                half_axis_m: Vector3::z() * (0.7 * half),
+                half_width_m: half,
+                colour: colour.map(|c| c * (0.9 + 0.2 * unit(seed, k, 5) as f32)),
+                opacity: 0.35,
+                billow: (unit(seed, k, 6) as f32, unit(seed, k, 7) as f32),
+            });
+        }
     }
 
     /// A puddle that glitters.
