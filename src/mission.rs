@@ -17,10 +17,12 @@ use std::sync::Arc;
 
 mod gimbal;
 mod links;
+mod right_eye;
 mod terrain;
 
 pub use links::{GroundLinks, MavlinkSigning, load_signing_key};
 use links::{RawGround, RawMavlink};
+pub use right_eye::RightEyeConfig;
 
 /// Why a mission file was refused.
 #[derive(Debug, thiserror::Error)]
@@ -83,6 +85,8 @@ pub struct Mission {
     pub camera_url: String,
     /// The detector.
     pub detector: DetectorConfig,
+    /// The right eye's detector, where that eye sees another spectrum.
+    pub right_eye: Option<RightEyeConfig>,
     /// How ranges are measured.
     pub range_method: Method,
     /// Numbers of ranging.
@@ -114,6 +118,8 @@ struct RawMission {
     mavlink: RawMavlink,
     camera: RawUrl,
     model: RawModel,
+    right_model: Option<RawModel>,
+    fusion: Option<right_eye::RawFusion>,
     #[serde(default)]
     range: RawRange,
     terrain: Option<terrain::RawTerrain>,
@@ -264,6 +270,25 @@ const KNOWN: &[&str] = &[
     "model.overlap_px",
     "model.frame_budget_ms",
     "model.threads",
+    "right_model.path",
+    "right_model.sha256",
+    "right_model.family",
+    "right_model.names",
+    "right_model.classes.*",
+    "right_model.yolox_output",
+    "right_model.anchors",
+    "right_model.providers",
+    "right_model.threshold",
+    "right_model.whole_frame_only",
+    "right_model.tile_px",
+    "right_model.overlap_px",
+    "right_model.frame_budget_ms",
+    "right_model.threads",
+    "fusion.agree_giou",
+    "fusion.contend_giou",
+    "fusion.one_sided",
+    "fusion.right_trust",
+    "fusion.threshold",
     "range.mask",
     "range.max_disparity_px",
     "range.max_sigma_over_range",
@@ -437,6 +462,7 @@ fn check_numbers(checks: &mut Checks, raw: &RawMission) {
     model
         .into_iter()
         .for_each(|problem| checks.problem(format!("model.{problem}")));
+    right_eye::check(checks, raw.right_model.as_ref(), raw.fusion.as_ref());
     for problem in range {
         // The mission says what the number is for, the matcher what OpenCV calls it.
         let problem = problem.replace("num_disparities", "max_disparity_px");
@@ -533,6 +559,7 @@ fn build(raw: RawMission, path: &Path) -> Result<Mission, MissionError> {
         .map_or_else(|| Path::new(".emberfix").join(&raw.name), beside);
     Ok(Mission {
         detector: detector(&raw.model, &beside),
+        right_eye: right_eye::right_eye(raw.right_model.as_ref(), raw.fusion.as_ref(), &beside),
         range_method: method(&raw.range).unwrap_or_default(),
         range: range(&raw.range),
         pose: PoseConfig {

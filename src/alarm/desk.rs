@@ -195,7 +195,7 @@ impl AlarmDesk {
                 uav: self.uav.clone(),
                 class: fire.class,
                 state: state(fire, &situation.assessment),
-                confidence: fire.evidence.probability(),
+                confidence: fire.event.probability(),
                 first_seen_at: fire.first_seen,
                 captured_at: fire.last_seen,
                 altitude_msl_m: situation.altitude.m(),

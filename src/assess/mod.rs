@@ -6,7 +6,7 @@
 //!
 //! [`outline`] turns boxes into rays and planes, [`extent`] those into size and, with `front`, into an
 //! oval and its motion, [`fusion`] two channels into one intensity, [`trend`] that into growing, steady or dying; [`watch`] keeps all
-//! of it per fire. [`printed`] is P1's fusion, to measure against.
+//! of it per fire. [`patch`] compares pictures. [`printed`] is P1's fusion, to measure against.
 //!
 //! **Known limits.** A spectrometer sees the whole scene: its light is used while one fire is seen. A near-infrared
 //! eye shows each fire by itself.
@@ -16,6 +16,7 @@ mod front;
 pub mod fusion;
 pub mod height;
 pub mod outline;
+pub mod patch;
 pub mod printed;
 pub mod spectrum;
 pub mod trend;

@@ -12,6 +12,7 @@ mod run;
 
 use crate::detect::{self, BoxFileDetector, Detector};
 use crate::mission::Mission;
+use crate::pipeline::RightEye;
 use clap::{Parser, Subcommand};
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
@@ -141,6 +142,15 @@ pub(crate) fn detector(
         Some(path) => Box::new(BoxFileDetector::load(path).map_err(Failure::refused)?),
         None => detect::open(&mission.detector).map_err(Failure::refused)?,
     })
+}
+
+/// The right eye's model, where the mission has one.
+pub(crate) fn right_eye(mission: &Mission) -> Result<Option<RightEye>, Failure> {
+    let Some(config) = &mission.right_eye else {
+        return Ok(None);
+    };
+    let detector = detect::open(&config.detector).map_err(Failure::refused)?;
+    Ok(Some(RightEye::new(detector, config.fusion)))
 }
 
 /// A runtime for the commands that talk.

@@ -61,7 +61,8 @@ fn images_and_telemetry(
     let detector = detector(mission, arguments.boxes.as_deref())?;
     let ranger = range::open(mission.range_method, &mission.rig, &mission.range)
         .map_err(Failure::refused)?;
-    let pipeline = Pipeline::new(mission, detector, ranger, FireId(1));
+    let pipeline = Pipeline::new(mission, detector, ranger, FireId(1))
+        .with_right_eye(super::right_eye(mission)?);
     let replay = Replay::open(&arguments.recording, mission, pipeline);
     let bar = ProgressBar::new_spinner();
     if let Ok(style) = ProgressStyle::with_template("{spinner} replay: {msg}, {elapsed}") {

@@ -61,7 +61,8 @@ pub fn run(arguments: RunArguments) -> Result<(), Failure> {
     let first = outbox
         .next_fire_number()
         .map_err(|error| fail(error.into()))?;
-    let pipeline = Pipeline::new(&mission, detector, ranger, first);
+    let pipeline = Pipeline::new(&mission, detector, ranger, first)
+        .with_right_eye(super::right_eye(&mission)?);
     runtime()?
         .block_on(service::run(
             mission,

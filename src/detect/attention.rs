@@ -58,6 +58,19 @@ impl GroundScale {
         }
     }
 
+    /// The scale of the ground about a place (column, row), raw pixels; `None` where none is seen.
+    #[must_use]
+    pub fn px_per_m(&self, (column, row): (f64, f64)) -> Option<f64> {
+        let cell = |at: f64, length: f64, count: usize| {
+            ((at / length * count as f64).max(0.0) as usize).min(count - 1)
+        };
+        let (across, down) = (
+            cell(column, self.image.0, self.columns),
+            cell(row, self.image.1, self.rows),
+        );
+        self.px_per_m.get(down * self.columns + across).copied()?
+    }
+
     /// The smallest scale of the ground in a part of the image, raw pixels; `None` where none is seen.
     fn least_in(&self, across: &Range<f64>, down: &Range<f64>) -> Option<f64> {
         let cells = |range: &Range<f64>, count: usize, length: f64| {

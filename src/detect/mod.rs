@@ -23,6 +23,7 @@ mod boxfile;
 mod config;
 mod error;
 mod family;
+pub mod fuse;
 #[cfg(test)]
 mod lookalike;
 mod mask;
@@ -99,16 +100,43 @@ impl BoxPx {
         (self.x + self.width / 2.0, self.y + self.height)
     }
 
-    /// Area of overlap over area of union, 0..1.
+    /// Square pixels.
     #[must_use]
-    pub fn iou(&self, other: &Self) -> f64 {
+    pub fn area_px2(&self) -> f64 {
+        self.width * self.height
+    }
+
+    /// Area of overlap, square pixels.
+    #[must_use]
+    pub fn shared_px2(&self, other: &Self) -> f64 {
         let overlap = |a: f64, a_len: f64, b: f64, b_len: f64| {
             ((a + a_len).min(b + b_len) - a.max(b)).max(0.0)
         };
-        let shared = overlap(self.x, self.width, other.x, other.width)
-            * overlap(self.y, self.height, other.y, other.height);
-        let all = self.width * self.height + other.width * other.height - shared;
+        overlap(self.x, self.width, other.x, other.width)
+            * overlap(self.y, self.height, other.y, other.height)
+    }
+
+    /// Area of overlap over area of union, 0..1.
+    #[must_use]
+    pub fn iou(&self, other: &Self) -> f64 {
+        let shared = self.shared_px2(other);
+        let all = self.area_px2() + other.area_px2() - shared;
         if all > 0.0 { shared / all } else { 0.0 }
+    }
+
+    /// IoU, less what the smallest box about both holds besides them, as a share of it: -1..1.
+    #[must_use]
+    pub fn giou(&self, other: &Self) -> f64 {
+        let about = |a: f64, a_len: f64, b: f64, b_len: f64| (a + a_len).max(b + b_len) - a.min(b);
+        let about = about(self.x, self.width, other.x, other.width)
+            * about(self.y, self.height, other.y, other.height);
+        let iou = self.iou(other);
+        let union = self.area_px2() + other.area_px2() - self.shared_px2(other);
+        if about > 0.0 {
+            iou - (about - union) / about
+        } else {
+            0.0
+        }
     }
 }
 

@@ -15,11 +15,13 @@ mod feature;
 mod ground;
 mod light;
 mod selfcheck;
+pub mod spectra;
 mod vision;
 
 pub use chips::{Chip, MAX_BYTES as MAX_CHIP_BYTES};
 pub use counters::Counters;
 pub use selfcheck::{Fault, SelfCheck};
+pub use spectra::RightEye;
 pub use vision::{Seen, Vision};
 
 use crate::alarm::{Action, Alarm, AlarmDesk, Area, FireId, Situation};
@@ -103,8 +105,9 @@ pub struct Pipeline {
     terrain: Option<Arc<dyn Terrain>>,
     shared: SharedPriors,
     vision: Vision,
-    /// Whether the detector's time is bounded, so that it must choose where to look.
-    bounded: bool,
+    /// Whether looking needs to know how large things on the ground appear: to choose where to look first, or
+    /// to find a thing of one eye in the other.
+    needs_scale: bool,
     check: SelfCheck,
     poses: PoseEstimator,
     tracker: Tracker,
@@ -154,7 +157,7 @@ impl Pipeline {
             terrain: mission.terrain.clone(),
             shared: mission.shared,
             vision: Vision::new(&mission.rig, detector, ranger),
-            bounded: mission.detector.frame_budget_ms.is_some(),
+            needs_scale: mission.detector.frame_budget_ms.is_some(),
             check: SelfCheck::new(mission.rig.sigmas().disparity_bias_px),
             poses: PoseEstimator::new(mission.pose),
             tracker: Tracker::new(mission.track, first_fire),
@@ -172,6 +175,14 @@ impl Pipeline {
             counters: Counters::default(),
             degraded: Vec::new(),
         }
+    }
+
+    /// The same loop, with a detector on a right eye that sees another spectrum.
+    #[must_use]
+    pub fn with_right_eye(mut self, right_eye: Option<RightEye>) -> Self {
+        self.needs_scale |= right_eye.is_some();
+        self.vision = self.vision.with_right_eye(right_eye);
+        self
     }
 
     /// Takes one event in. Arrivals never run backwards: an earlier one counts as now.
@@ -412,7 +423,7 @@ impl Pipeline {
         let rig = Arc::clone(&self.rig);
         let view = View::new(&rig, pose, &self.shared, &self.datum);
         let ground = self
-            .bounded
+            .needs_scale
             .then(|| ground::scale(&view, self.terrain.as_deref()));
         let looked = self.vision.look(pair, ground.flatten(), &mut self.counters);
         let Some(seen) = looked else {

@@ -1,8 +1,10 @@
 //! One pair to sightings: decode, judge the eyes, detect, range.
 
+use super::spectra::RightEye;
 use super::{Counters, light};
 use crate::alarm::AlarmClass;
 use crate::assess::PLAIN_LEVEL;
+use crate::assess::patch::{MARGIN, Patch, SIDE};
 use crate::detect::{BoxPx, Detection, DetectionClass, Detector, GroundScale, LeftImage, Looked};
 use crate::ingest::{EncodedImage, EyeHealth, EyeWatch, ImageDecoder, StereoPair};
 use crate::locate::{DisparityOf, Sighting};
@@ -10,7 +12,8 @@ use crate::range::{Disparity, EyeComparer, EyesCompared, Ranger, Ranging, RawPai
 use crate::track::Classified;
 use emberfix_calib::{Eye, RawPixel, RectifiedPixel, Rig};
 use emberfix_frames::{ServiceTime, SignedDuration, Stamped};
-use opencv::core::{Mat, MatTraitConst};
+use opencv::core::{Mat, MatTraitConst, Point2f, Size, Vec3b};
+use opencv::imgproc;
 use opencv::prelude::MatTraitConstManual;
 use std::sync::Arc;
 
@@ -43,6 +46,7 @@ pub struct Vision {
     left_watch: EyeWatch,
     right_watch: EyeWatch,
     detector: Box<dyn Detector>,
+    right_eye: Option<RightEye>,
     ranger: Box<dyn Ranger>,
     comparer: Option<EyeComparer>,
     compared: Option<ServiceTime>,
@@ -68,11 +72,19 @@ impl Vision {
             left_watch: EyeWatch::default(),
             right_watch: EyeWatch::default(),
             detector,
+            right_eye: None,
             ranger,
             // A rig that was rectified to be checked has maps.
             comparer: EyeComparer::new(rig).ok(),
             compared: None,
         }
+    }
+
+    /// The same, with a detector on a right eye that sees another spectrum.
+    #[must_use]
+    pub fn with_right_eye(mut self, right_eye: Option<RightEye>) -> Self {
+        self.right_eye = right_eye;
+        self
     }
 
     /// Looks at a pair; `ground` is how large things on the ground appear in its left image, where
@@ -90,7 +102,7 @@ impl Vision {
             bgr,
             ground,
         };
-        let found = match self.detector.detect(&image) {
+        let mut found = match self.detector.detect(&image) {
             Ok(found) => found,
             Err(error) => {
                 counters.add("detector", error.name());
@@ -100,6 +112,10 @@ impl Vision {
         };
         counters.add("pairs", "looked_at");
         let right_gray = self.right(pair.value.right.as_ref(), counters);
+        if let Some(right_eye) = &mut self.right_eye {
+            let right = (&image, right_gray.as_ref());
+            found = right_eye.decide(&self.rig, &found, right, counters);
+        }
         let raw = RawPair {
             at: pair.at,
             left_bgr: image.bgr,
@@ -260,6 +276,7 @@ impl Vision {
             sighting,
             class,
             score: detection.score,
+            patch: patch(&pair.left_bgr, &detection.box_px),
         })
     }
 
@@ -325,6 +342,20 @@ fn evidence(ranging: &Ranging) -> (Option<DisparityOf>, Option<f64>) {
     }
 }
 
+/// What a box and its margin look like, by green and red, in which flames are bright.
+fn patch(bgr: &Mat, box_px: &BoxPx) -> Option<Patch> {
+    let side = (MARGIN * box_px.width.max(box_px.height)).ceil().max(8.0) as i32;
+    let (column, row) = box_px.centre();
+    let middle = Point2f::new(column as f32, row as f32);
+    let (mut cut, mut small) = (Mat::default(), Mat::default());
+    imgproc::get_rect_sub_pix_def(bgr, Size::new(side, side), middle, &mut cut).ok()?;
+    let cells = Size::new(SIDE as i32, SIDE as i32);
+    imgproc::resize(&cut, &mut small, cells, 0.0, 0.0, imgproc::INTER_AREA).ok()?;
+    let pixels = small.data_typed::<Vec3b>().ok()?;
+    let levels = pixels.iter().map(|pixel| pixel[1] / 2 + pixel[2] / 2);
+    Some(Patch(levels.collect::<Vec<u8>>().try_into().ok()?))
+}
+
 /// Light of a box and a margin about it (see [`Sighting::glow`]).
 fn glow(bgr: &Mat, box_px: &BoxPx) -> Option<f64> {
     let margin = |length: f64| GLOW_MARGIN * length;
@@ -335,7 +366,7 @@ fn glow(bgr: &Mat, box_px: &BoxPx) -> Option<f64> {
     let lower = clamp(box_px.y + box_px.height + margin(box_px.height), bgr.rows());
     let mut sum = 0.0;
     for row in upper..lower {
-        let pixels = bgr.at_row::<opencv::core::Vec3b>(row).ok()?;
+        let pixels = bgr.at_row::<Vec3b>(row).ok()?;
         for pixel in pixels.get(left as usize..right as usize)? {
             let level = (f64::from(pixel[1]) + f64::from(pixel[2])) / 2.0;
             sum += (level - PLAIN_LEVEL).max(0.0);

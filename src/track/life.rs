@@ -1,4 +1,4 @@
-//! For and against a fire's being real, as log-odds over looks.
+//! For and against a fire's being there, as log-odds over looks. Whether it is a fire at all is [`super::event`]'s.
 
 use emberfix_frames::ServiceTime;
 use std::f64::consts::TAU;
@@ -68,8 +68,8 @@ impl Evidence {
     }
 
     /// A look that should have seen it and did not. From a side that it was never seen from,
-    /// something may hide it: that side takes so much and no more.
-    pub fn miss(&mut self, at: ServiceTime, azimuth_rad: f64) {
+    /// something may hide it: that side takes so much and no more. Says what share of a whole look it was.
+    pub fn miss(&mut self, at: ServiceTime, azimuth_rad: f64) -> f64 {
         let since_s = self
             .last_look
             .map_or(LOOK_S, |last| (at - last).as_secs_f64());
@@ -81,6 +81,7 @@ impl Evidence {
             self.unseen_from[sector] += amount;
         }
         self.add(amount);
+        amount / MISS
     }
 
     fn add(&mut self, amount: f64) {
@@ -94,7 +95,7 @@ impl Evidence {
         self.hits
     }
 
-    /// Probability that it is real.
+    /// Probability that it is there.
     #[must_use]
     pub fn probability(&self) -> f64 {
         1.0 / (1.0 + (-self.log_odds).exp())
@@ -155,14 +156,18 @@ mod tests {
         assert!(!evidence.is_convincing());
         let mut evidence = seen();
         assert!(evidence.is_convincing());
-        (6..46).for_each(|look| evidence.miss(at(look), 0.0));
+        for look in 6..46 {
+            evidence.miss(at(look), 0.0);
+        }
         assert!(evidence.is_refuted() && evidence.was_convincing());
     }
 
     #[test]
     fn a_tree_between_does_not_put_a_fire_out_but_looks_from_all_sides_do() {
         let mut evidence = seen();
-        (6..200).for_each(|look| evidence.miss(at(look), 2.0));
+        for look in 6..200 {
+            evidence.miss(at(look), 2.0);
+        }
         assert!(evidence.is_convincing(), "hidden from one side");
         for look in 200..400 {
             evidence.miss(at(look), 2.0 + 0.02 * (look - 200) as f64);

@@ -30,6 +30,7 @@ mod advice;
 mod assign;
 mod chart;
 mod estimate;
+pub mod event;
 mod glimpse;
 mod grid;
 mod ground;
@@ -50,6 +51,7 @@ pub use life::Evidence;
 pub use shared_errors::{Estimated, SharedErrors};
 
 use crate::alarm::{AlarmClass, FireId, FireState, Method, SizeM};
+use crate::assess::patch::Patch;
 use crate::locate::{Shared, Sighting, Terrain, View, fix};
 use emberfix_calib::RectifiedPixel;
 use emberfix_frames::{Coordinate, Covariance, Metres, MissionEnu, ServiceTime, Vector3};
@@ -68,6 +70,8 @@ pub struct Classified {
     pub class: AlarmClass,
     /// Detector score, 0..1.
     pub score: f64,
+    /// What it looks like, where its picture is at hand.
+    pub patch: Option<Patch>,
 }
 
 /// Settings of the tracker, from the mission.
@@ -102,7 +106,7 @@ pub struct Fire {
     pub state: FireState,
     /// Position and error.
     pub estimate: Estimate,
-    /// For and against its being real.
+    /// For and against its being there.
     pub evidence: Evidence,
     /// Mid-exposure of the first sighting.
     pub first_seen: ServiceTime,
@@ -110,6 +114,8 @@ pub struct Fire {
     pub last_seen: ServiceTime,
     /// Straight line from the left camera at the latest sighting, metres.
     pub range_m: f64,
+    /// What all looks together say of its being real.
+    pub event: event::Event,
     /// Extent, smoothed over sightings.
     pub size_m: Option<SizeM>,
     /// How its light changes from look to look.
@@ -187,6 +193,8 @@ const ROOM: usize = 256;
 const MAX_RELATIVE_SIGMA: f64 = 0.2;
 /// Horizontal sigma that is good enough from however near, metres.
 const NEAR_ENOUGH_M: f64 = 5.0;
+/// A fire is told from this probability of its being one.
+const LIKELY: f64 = 0.7;
 /// A fire counts as missed from up to this many times the range that it was seen from.
 const MISS_REACH: f64 = 1.1;
 /// How far the clock error's spread is looked over, in its sigmas and at most, seconds.
@@ -393,6 +401,7 @@ impl Tracker {
             state: FireState::Suspected,
             estimate,
             evidence: Evidence::default(),
+            event: event::Event::default(),
             first_seen: sighting.at,
             last_seen: sighting.at,
             range_m: 0.0,
@@ -459,6 +468,15 @@ impl Tracker {
                 fire.evidence.hit(sighting.at, azimuth, classified.score);
                 fire.last_seen = sighting.at;
                 note_extent(fire, sighting, view);
+                fire.event.saw(&event::Look {
+                    at: sighting.at,
+                    score: classified.score,
+                    is_smoke: classified.class == AlarmClass::Smoke,
+                    patch: classified.patch,
+                    glow: sighting.glow,
+                    range_m: fire.range_m,
+                    area_px2: sighting.size_px.0 * sighting.size_px.1,
+                });
                 let is_another = !in_doubt.contains(&fire.id);
                 advance(fire, &self.config, is_another);
             }
@@ -470,7 +488,8 @@ impl Tracker {
             let fire = &mut self.fires[glimpse.slot];
             if should_be_seen(fire, glimpse, view) {
                 let azimuth = azimuth(&fire.estimate.position_m(), view);
-                fire.evidence.miss(view.pose.at, azimuth);
+                let share = fire.evidence.miss(view.pose.at, azimuth);
+                fire.event.missed(share);
                 if fire.is_confirmed() && fire.evidence.is_refuted() {
                     fire.state = FireState::Out;
                 }
@@ -544,6 +563,7 @@ fn advance(fire: &mut Fire, config: &TrackConfig, is_another: bool) {
                 && is_another
                 && fire.evidence.is_convincing()
                 && fire.is_located()
+                && fire.event.probability() >= LIKELY
                 && !fire.flicker.may_be_lamp(fire.size_m, fire.evidence.hits()) =>
         {
             fire.state = FireState::Confirmed;

@@ -11,10 +11,12 @@ pub mod coco;
 mod coco_files;
 mod contact_sheet;
 pub mod dataset;
+pub mod events;
 mod hsv_rule;
 mod overhead;
 mod report;
 pub mod scores;
+pub mod spectra;
 pub mod tiling;
 
 pub use contact_sheet::SheetError;
@@ -84,6 +86,9 @@ pub enum DetectorEvalError {
     /// OpenCV refused.
     #[error(transparent)]
     OpenCv(#[from] opencv::Error),
+    /// A flight was not flown.
+    #[error(transparent)]
+    Events(#[from] events::EventsError),
     /// The worst pictures could not be drawn.
     #[error(transparent)]
     Sheet(#[from] SheetError),

@@ -88,7 +88,8 @@ fn header<const N: usize>(names: [&str; N]) -> Vec<String> {
     names.map(str::to_owned).to_vec()
 }
 
-fn fire_table(scored: &[Scored]) -> Table {
+/// AP and what the threshold makes of it, a row for each.
+pub fn fire_table(scored: &[Scored]) -> Table {
     let row = |scored: &Scored| {
         let fire = &scored.classes[0];
         let [small, medium, large] = fire.ap50_by_size.map(number);

@@ -90,6 +90,7 @@ impl Scene<'_> {
                 sighting: self.sighting(&view)?,
                 class: AlarmClass::Fire,
                 score: 0.9,
+                patch: None,
             };
             tracker.step(&view, &[seen], Some(&self.ground));
             let fire = tracker.fires().first()?;
