@@ -14,13 +14,13 @@ const OUTLINE_PX: usize = 2;
 const RIM_PX: usize = 1;
 /// How its error follows from what it saw.
 const FACTORS: Factors = Factors {
-    scatter: 0.49,
-    unlike: 0.43,
-    least_px: 0.044,
+    scatter: 0.46,
+    unlike: 0.25,
+    least_px: 0.026,
 };
 /// The same between two spectra, where grey levels are unlike anyway: a third of it is the flame's doing.
 const TWO_SPECTRA: Factors = Factors {
-    unlike: 0.14,
+    unlike: 0.12,
     ..FACTORS
 };
 /// Disagreement of the search there and back that is none.
@@ -41,7 +41,8 @@ pub(super) fn find(scene: &Scene<'_>, config: &RangeConfig) -> Result<Matched, M
     there_and_back(scene, &outlined, &peak)?;
     let right = scene.opposite(peak.at)?;
     let weights = scene.weights(RIM_PX);
-    let refined = Refiner::new(&scene.left, &right, &weights, -peak.at)
+    let left = scene.left_like(&right, peak.at)?;
+    let refined = Refiner::new(&left, &right, &weights, -peak.at)
         .and_then(|refiner| refiner.refine(LEAST_ALONG))
         .ok_or(Refusal::Inconsistent)?;
     Ok(Matched {

@@ -30,14 +30,14 @@ const LEAST_ALONG_SPECTRA: f64 = 0.1;
 
 /// How its error follows from what it saw; equal bits are few even between alike eyes.
 const FACTORS: Factors = Factors {
-    scatter: 0.89,
-    unlike: 0.024,
+    scatter: 0.80,
+    unlike: 0.022,
     least_px: 0.02,
 };
 /// Across two spectra: a flame's outlines are not quite the same in both.
 const ACROSS: Factors = Factors {
-    scatter: 1.14,
-    unlike: 0.031,
+    scatter: 0.97,
+    unlike: 0.026,
     ..FACTORS
 };
 
@@ -49,7 +49,11 @@ pub(super) fn find(scene: &Scene<'_>, config: &RangeConfig) -> Result<Matched, M
     let right = scene.right_whole()?;
     let curve = census_curve(&scene.left, &right, &runs, scene.search.offsets());
     let best = rival_free(&curve, LEAST_LIKENESS, -scene.search.greatest)?;
-    let (left, right) = (gradient(&scene.left), gradient(&*scene.opposite(best.at)?));
+    let right = scene.opposite(best.at)?;
+    let (left, right) = (
+        gradient(&scene.left_like(&right, best.at)?),
+        gradient(&right),
+    );
     let weights = scene.weights(OUTLINE_PX);
     let refined = Refiner::new(&left, &right, &weights, -best.at)
         .and_then(|refiner| refiner.refine(LEAST_ALONG_SPECTRA))

@@ -52,7 +52,7 @@ pub(super) struct Sigma {
 /// flames the light lies 0.035 widths before the axis (soot hides the soot behind it) with a scatter of
 /// 0.055 (in still air) to 0.080 (leaning in the wind); the outlines that match are of single tongues and
 /// scatter more.
-const DEPTH: f64 = 0.11;
+const DEPTH: f64 = 0.10;
 
 impl Matched {
     /// What its error comes to, for a target whose width is as much disparity as `depth_px`.

@@ -84,7 +84,7 @@ pub(super) struct Cutter {
 }
 
 /// Luma as OpenCV weighs blue, green, red.
-const LUMA: [f32; 3] = [0.114, 0.587, 0.299];
+pub(super) const LUMA: [f32; 3] = [0.114, 0.587, 0.299];
 /// The exact camera model runs at every so many columns and rows, and straight lines between: on a lens
 /// that bends by k1 = -0.1 that is within 0.005 px.
 const KNOTS_PX: usize = 8;
@@ -211,11 +211,21 @@ impl Cutter {
 
     /// The left eye over an area in gray, at the exact places.
     pub fn left_gray(&self, image: &Mat, area: Area) -> Result<Gray, RangeError> {
+        self.left_mixed(image, area, LUMA)
+    }
+
+    /// The left eye over an area at the exact places, in a mixture of blue, green and red.
+    pub fn left_mixed(
+        &self,
+        image: &Mat,
+        area: Area,
+        mixture: [f32; 3],
+    ) -> Result<Gray, RangeError> {
         let area = area.within_rows(self.size().1);
         let raw = Raw::<3>::of(image)?;
-        let luma = self.luma(&raw, area);
+        let crop = self.crop(Eye::Left, &raw, area, |bgr| mixed(bgr, mixture));
         let mut values = Vec::with_capacity(area.width() * area.height());
-        let seen = self.each_place(Eye::Left, area, 1, |u, v| values.push(luma.cubic(u, v)));
+        let seen = self.each_place(Eye::Left, area, 1, |u, v| values.push(crop.cubic(u, v)));
         Ok(Gray { area, seen, values })
     }
 
@@ -227,10 +237,6 @@ impl Cutter {
         let mut values = Vec::with_capacity(area.width() * area.height());
         let seen = self.each_place(Eye::Right, area, 1, |u, v| values.push(crop.cubic(u, v)));
         Ok(Gray { area, seen, values })
-    }
-
-    fn luma(&self, raw: &Raw<'_, 3>, area: Area) -> Crop {
-        self.crop(Eye::Left, raw, area, luma)
     }
 
     /// The raw pixels that an area may need, each as one number.
@@ -322,7 +328,11 @@ impl Cutter {
 }
 
 fn luma(bgr: &[u8; 3]) -> f32 {
-    (0..3).map(|c| LUMA[c] * f32::from(bgr[c])).sum()
+    mixed(bgr, LUMA)
+}
+
+fn mixed(bgr: &[u8; 3], mixture: [f32; 3]) -> f32 {
+    (0..3).map(|c| mixture[c] * f32::from(bgr[c])).sum()
 }
 
 /// Pixels beyond an area that interpolation and the bend of its edges need.

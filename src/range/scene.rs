@@ -1,11 +1,12 @@
 //! What all methods look at: one target's surroundings in both eyes, and which pixels are flame.
 
 use super::error::{Matched, Sigma};
-use super::patch::{Area, Colour, Cutter, Gray};
+use super::patch::{Area, Colour, Cutter, Gray, LUMA};
 use super::refine::Weights;
 use super::search::rows_apart;
 use super::{Miss, RangeConfig, RangeError, RawPair, Refusal, Target};
 use crate::detect::DetectionClass;
+use nalgebra::{Matrix3, Vector3};
 use opencv::core::Mat;
 use std::cell::RefCell;
 use std::ops::RangeInclusive;
@@ -134,6 +135,8 @@ pub(super) struct Scene<'a> {
     pub target: Area,
     /// The box and its context.
     pub context: Area,
+    /// The box and its context in the left eye, in colour.
+    colour: Colour,
     /// The box and a little around in the left eye, exactly.
     pub left: Gray,
     /// The same rows of the right eye, as far as the search reaches, good to whole pixels; only rows `every`
@@ -184,6 +187,7 @@ impl<'a> Scene<'a> {
             left_bgr: &pair.left_bgr,
             target: area,
             context: colour.area,
+            colour,
             left: cutter.left_gray(&pair.left_bgr, near)?,
             right,
             every,
@@ -234,6 +238,15 @@ impl<'a> Scene<'a> {
         Ok(gray)
     }
 
+    /// The left eye in that mixture of its colours which is most like what the right one shows `offset` columns
+    /// on: a sensor without colours answers to a flame's red unlike one whose red alone is saturated, and in
+    /// another spectrum colours are told apart by another brightness.
+    pub fn left_like(&self, right: &Gray, offset: i32) -> Result<Gray, RangeError> {
+        let mixture = mixture(&self.colour, right, offset);
+        self.cutter
+            .left_mixed(self.left_bgr, self.left.area, mixture)
+    }
+
     /// The left eye as far as what the right one shows `offset` columns on may come from there.
     /// In rows `every` apart.
     pub fn back(&self, offset: i32) -> Result<Gray, RangeError> {
@@ -243,6 +256,60 @@ impl<'a> Scene<'a> {
             0,
         );
         self.cutter.left_draft(self.left_bgr, area, self.every)
+    }
+}
+
+/// Noise of a grey level against how far a mixture may be from luma, squared: what little colour says moves
+/// little.
+const HELD: f64 = 25.0 / 0.09;
+
+/// Pixels that a mixture is found from, about.
+const MIXED_FROM: usize = 600;
+
+/// The mixture of blue, green and red that explains most of the right eye's grey (least squares, held to luma),
+/// with luma's own contrast. A gain between the eyes stays for whoever compares them.
+fn mixture(colour: &Colour, right: &Gray, offset: i32) -> [f32; 3] {
+    let luma = Vector3::from(LUMA.map(f64::from));
+    let (mut n, mut grey) = (0.0, 0.0);
+    let (mut mean, mut both) = (Vector3::zeros(), Vector3::zeros());
+    let mut squares = Matrix3::zeros();
+    let rows = colour.area.top.max(right.area.top)..colour.area.bottom.min(right.area.bottom);
+    let from = colour
+        .area
+        .left
+        .max(right.seen.0.max(right.area.left) - offset);
+    let to = (colour.area.right).min(right.seen.1.min(right.area.right) - offset);
+    let all = rows.len() * usize::try_from(to - from).unwrap_or(0);
+    let every = all.div_ceil(MIXED_FROM).isqrt().max(1);
+    for row in rows.step_by(every) {
+        let line = (row - colour.area.top) as usize * colour.area.width();
+        for column in (from..to).step_by(every) {
+            let bgr = colour.bgr[line + (column - colour.area.left) as usize];
+            let bgr = Vector3::from(bgr.map(f64::from));
+            let level = f64::from(right.at(column + offset, row));
+            (n, grey) = (n + 1.0, grey + level);
+            mean += bgr;
+            both += bgr * level;
+            squares += bgr * bgr.transpose();
+        }
+    }
+    if n < 1.0 {
+        return LUMA;
+    }
+    let squares = squares - mean * mean.transpose() / n;
+    let both = both - mean * (grey / n);
+    let contrast = |mixture: &Vector3<f64>| (squares * mixture).dot(mixture);
+    let gain = luma.dot(&both) / contrast(&luma);
+    let held = squares + Matrix3::from_diagonal_element(HELD);
+    let found = held
+        .cholesky()
+        .map(|held| held.solve(&(both + luma * (gain * HELD))));
+    match found {
+        Some(found) if gain > 0.0 && contrast(&found) > 0.0 => {
+            let kept = (contrast(&luma) / contrast(&found)).sqrt();
+            (found * kept).map(|weight| weight as f32).into()
+        }
+        _ => LUMA,
     }
 }
 

@@ -55,7 +55,7 @@ impl SemiGlobal {
             found,
             likeness: 1.0,
             dullness: 0.0,
-            factors: if scene.two_spectra { &ACROSS } else { &FACTORS },
+            factors: &FACTORS,
         })
     }
 
@@ -90,15 +90,9 @@ impl SemiGlobal {
 const UNSETTLED_PX: f64 = 1.7;
 /// How its error follows from that: whole pixels pull at its disparities, whatever agrees.
 const FACTORS: Factors = Factors {
-    scatter: 1.0,
+    scatter: 0.95,
     unlike: 0.0,
-    least_px: 0.12,
-};
-/// Across two spectra: what it finds of few pixels is by chance more often.
-const ACROSS: Factors = Factors {
-    scatter: 1.25,
-    least_px: 0.15,
-    ..FACTORS
+    least_px: 0.114,
 };
 /// Share of the flame that must have a valid disparity: where less has, the eyes show it differently.
 const LEAST_COVERED: f64 = 0.5;
