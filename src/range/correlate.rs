@@ -16,7 +16,7 @@ const RIM_PX: usize = 1;
 const FACTORS: Factors = Factors {
     scatter: 0.46,
     unlike: 0.25,
-    least_px: 0.026,
+    least_px: 0.022,
 };
 /// The same between two spectra, where grey levels are unlike anyway: a third of it is the flame's doing.
 const TWO_SPECTRA: Factors = Factors {

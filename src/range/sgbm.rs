@@ -90,9 +90,9 @@ impl SemiGlobal {
 const UNSETTLED_PX: f64 = 1.7;
 /// How its error follows from that: whole pixels pull at its disparities, whatever agrees.
 const FACTORS: Factors = Factors {
-    scatter: 0.95,
+    scatter: 0.98,
     unlike: 0.0,
-    least_px: 0.114,
+    least_px: 0.118,
 };
 /// Share of the flame that must have a valid disparity: where less has, the eyes show it differently.
 const LEAST_COVERED: f64 = 0.5;
