@@ -2,6 +2,7 @@
 //! squares below the pixel.
 
 use super::error::{Factors, Matched};
+use super::patch::Gray;
 use super::refine::{LEAST_ALONG, Refined, Refiner};
 use super::scene::{Mask, Run, Scene};
 use super::search::{Curve, Peak, correlate};
@@ -15,12 +16,12 @@ const RIM_PX: usize = 1;
 /// How its error follows from what it saw.
 const FACTORS: Factors = Factors {
     scatter: 0.46,
-    unlike: 0.25,
+    unlike: 0.43,
     least_px: 0.022,
 };
 /// The same between two spectra, where grey levels are unlike anyway: a third of it is the flame's doing.
 const TWO_SPECTRA: Factors = Factors {
-    unlike: 0.12,
+    unlike: 0.14,
     ..FACTORS
 };
 /// Disagreement of the search there and back that is none.
@@ -47,7 +48,7 @@ pub(super) fn find(scene: &Scene<'_>, config: &RangeConfig) -> Result<Matched, M
         .ok_or(Refusal::Inconsistent)?;
     Ok(Matched {
         found: disparity(&scene.flame, &refined.found),
-        likeness: peak.correlation,
+        likeness: likeness(&left, &right, &outlined, peak.at),
         dullness: refined.dullness,
         factors: if scene.two_spectra {
             &TWO_SPECTRA
@@ -55,6 +56,12 @@ pub(super) fn find(scene: &Scene<'_>, config: &RangeConfig) -> Result<Matched, M
             &FACTORS
         },
     })
+}
+
+/// Correlation of what was compared, at one place.
+fn likeness(left: &Gray, right: &Gray, runs: &[Run], at: i32) -> f64 {
+    let curve = correlate(left, right, runs, 1, at..=at);
+    curve.peaks().first().map_or(0.0, |peak| peak.correlation)
 }
 
 /// The best place in the right eye, if it is good enough and has no rival.
