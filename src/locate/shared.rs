@@ -71,8 +71,8 @@ pub struct SharedPriors {
 }
 
 impl Default for SharedPriors {
-    /// A consumer receiver and compass. Receivers state 0.05 m/s of their Doppler velocity in half of all
-    /// cases (u-blox NEO-M9N data sheet, 2020); twice that leaves room for what an autopilot makes of it.
+    /// A consumer receiver and compass. What is said of the velocity is an assumption that no log was held
+    /// against yet.
     fn default() -> Self {
         Self {
             gnss_constant_share: 0.5,

@@ -2,8 +2,8 @@
 //!
 //! **Purpose.** Finds the disparity of one target: rectifies what is around its box (`patch`), keeps
 //! the pixels that look like flame (`mask`), matches them in the right eye by each method, with the left
-//! eye's colours mixed as the right eye sees them (`scene`), and says
-//! what the error of the answer is made of (`error`).
+//! eye's colours mixed as the right eye sees them (`scene`), and says what the error of the answer is made
+//! of (`error`).
 //! **In:** the decoded pair, raw, and a box in the raw left image; once per detection. **Out:**
 //! [`Ranging`]: a disparity in rectified pixels (`u_left - u_right`, positive in front), its sigma
 //! and the centroid of the pixels that it rests on, or a named reason why there is none.
