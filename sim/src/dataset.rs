@@ -5,13 +5,19 @@
 //! centre y, width, height, all but the class as shares of the side; class 0 is fire, 1 smoke; an
 //! empty file is a picture without either).
 //!
+//! With [`Form::outlines`] a label is an outline instead: the class, then columns and rows of a closed line's
+//! corners as shares of the sides, which encloses the pixels of flame or smoke by the rule of odd crossings.
+//!
 //! Most pictures are cut from the raw left image at its own scale; some are the whole image, shrunk
 //! and letter-boxed. Or, by [`Framing::Whole`], each is the raw left image as it is. The same rig, count,
 //! seed and framing give the same bytes.
 //! **Known limits.** One lens and one kind of flame: real pictures must be mixed in.
 
+mod label;
+mod outline;
+
 use crate::render::{
-    Frame, LabelBox, PixelFormat, RenderConfig, Renderer, StereoCamera, encode_jpeg,
+    Frame, LabelBox, LabelMask, PixelFormat, RenderConfig, Renderer, StereoCamera, encode_jpeg,
 };
 use crate::state::BodyState;
 use crate::world::{
@@ -20,6 +26,7 @@ use crate::world::{
 };
 use emberfix_calib::{Eye, Rig};
 use image::{RgbImage, imageops};
+use label::{Window, YoloLabel};
 use nalgebra::{Matrix3, Vector2, Vector3};
 use rand::seq::IndexedRandom;
 use rand::{Rng, SeedableRng};
@@ -35,10 +42,6 @@ const SIDE: u32 = 416;
 const BARS: u8 = 114;
 /// Pictures taken in one world.
 const POSES: usize = 4;
-/// A thing cut by the picture's edge to less than this share isn't labelled.
-const LEAST_SHARE: f64 = 0.3;
-/// Narrower or lower than this isn't labelled, pixels of the picture.
-const LEAST_PX: f64 = 2.5;
 
 /// Why no data set was written.
 #[derive(Debug, thiserror::Error)]
@@ -73,6 +76,15 @@ pub enum Framing {
     Whole,
 }
 
+/// How pictures and labels are written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Form {
+    /// What pictures show.
+    pub framing: Framing,
+    /// Labels are outlines instead of boxes.
+    pub outlines: bool,
+}
+
 /// What was written.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct DatasetSummary {
@@ -97,7 +109,7 @@ pub fn write(
     pictures: usize,
     seed: u64,
     rig: &Rig,
-    framing: Framing,
+    form: Form,
 ) -> Result<DatasetSummary, DatasetError> {
     let camera = StereoCamera::new(rig);
     let (width, height) = camera.image_size_px(Eye::Left);
@@ -114,7 +126,7 @@ pub fn write(
         .map(|k| {
             let numbers = k * POSES..((k + 1) * POSES).min(pictures);
             let seed = seed.wrapping_add((k as u64) << 20);
-            write_world(dir, numbers, seed, &camera, framing)
+            write_world(dir, numbers, seed, &camera, form)
         })
         .collect();
     Ok(summaries?
@@ -133,7 +145,7 @@ impl DatasetSummary {
         }
     }
 
-    fn count(&mut self, labels: &[YoloBox]) {
+    fn count(&mut self, labels: &[YoloLabel]) {
         let fires = labels
             .iter()
             .filter(|label| label.class == BurningClass::Fire)
@@ -151,7 +163,7 @@ fn write_world(
     numbers: std::ops::Range<usize>,
     seed: u64,
     camera: &StereoCamera,
-    framing: Framing,
+    form: Form,
 ) -> Result<DatasetSummary, DatasetError> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let config = random_world(&mut rng);
@@ -166,11 +178,14 @@ fn write_world(
         let t_s = rng.random_range(0.0..600.0);
         let body = random_pose(&mut rng, &config, renderer.world(), camera);
         let frame = renderer.render(Eye::Left, &body, t_s);
-        let boxes = renderer.label_boxes(&body, t_s);
-        let picture = match framing {
-            Framing::Cut => cut(&mut rng, &frame, &boxes),
-            Framing::Whole => whole(frame, &boxes),
+        let masks = renderer.label_masks(&body, t_s);
+        let (frame, window) = match form.framing {
+            Framing::Cut => cut(&mut rng, &frame, &masks),
+            Framing::Whole => whole(frame),
         };
+        let label = |mask| window.label(mask, form.outlines);
+        let labels = masks.iter().filter_map(label).collect();
+        let picture = Picture { frame, labels };
         summary.count(&picture.labels);
         save(dir, number, &picture, rng.random_range(70..=95))?;
     }
@@ -178,7 +193,7 @@ fn write_world(
 }
 
 fn save(dir: &Path, number: usize, picture: &Picture, quality: u8) -> Result<(), DatasetError> {
-    let text: String = picture.labels.iter().map(YoloBox::line).collect();
+    let text: String = picture.labels.iter().map(YoloLabel::line).collect();
     let files = [
         (
             dir.join(format!("images/{number:06}.jpg")),
@@ -198,98 +213,29 @@ fn save(dir: &Path, number: usize, picture: &Picture, quality: u8) -> Result<(),
 /// A picture as the detector gets it.
 struct Picture {
     frame: Frame,
-    labels: Vec<YoloBox>,
+    labels: Vec<YoloLabel>,
 }
 
-/// Edges as shares of the picture's width and height.
-struct YoloBox {
-    class: BurningClass,
-    left: f64,
-    top: f64,
-    right: f64,
-    bottom: f64,
-}
-
-impl YoloBox {
-    fn line(&self) -> String {
-        let class = match self.class {
-            BurningClass::Fire => 0,
-            BurningClass::Smoke => 1,
-        };
-        let (cx, cy) = (
-            0.5 * (self.left + self.right),
-            0.5 * (self.top + self.bottom),
-        );
-        let (width, height) = (self.right - self.left, self.bottom - self.top);
-        format!("{class} {cx:.6} {cy:.6} {width:.6} {height:.6}\n")
-    }
-}
-
-/// How raw pixels become pixels of the picture: `picture = raw * scale + shift`.
-struct Window {
-    scale: f64,
-    shift: (f64, f64),
-    /// Columns and rows of the picture.
-    size: (f64, f64),
-    /// Rows of the picture that hold the image; columns always do.
-    rows: (f64, f64),
-}
-
-impl Window {
-    fn label(&self, label: &LabelBox) -> Option<YoloBox> {
-        let (width, height) = self.size;
-        // Half a pixel: label edges count from the first pixel's centre, shares from its edge.
-        let across = |px: f64| (px + 0.5) * self.scale + self.shift.0;
-        let down = |px: f64| (px + 0.5) * self.scale + self.shift.1;
-        let whole = (label.right_px - label.left_px)
-            * (label.bottom_px - label.top_px)
-            * self.scale.powi(2);
-        let (left, right) = (
-            across(label.left_px).max(0.0),
-            across(label.right_px).min(width),
-        );
-        let (top, bottom) = (
-            down(label.top_px).max(self.rows.0),
-            down(label.bottom_px).min(self.rows.1),
-        );
-        let seen = (right - left).max(0.0) * (bottom - top).max(0.0);
-        let big = right - left >= LEAST_PX && bottom - top >= LEAST_PX;
-        (big && seen >= LEAST_SHARE * whole).then(|| YoloBox {
-            class: label.class,
-            left: left / width,
-            top: top / height,
-            right: right / width,
-            bottom: bottom / height,
-        })
-    }
-}
-
-fn cut(rng: &mut ChaCha8Rng, frame: &Frame, boxes: &[LabelBox]) -> Picture {
-    let (frame, window) = if rng.random_bool(0.15) {
+fn cut(rng: &mut ChaCha8Rng, frame: &Frame, masks: &[LabelMask]) -> (Frame, Window) {
+    if rng.random_bool(0.15) {
         letter_boxed(frame)
     } else {
-        cropped(rng, frame, boxes)
-    };
-    let labels = boxes
-        .iter()
-        .filter_map(|label| window.label(label))
-        .collect();
-    Picture { frame, labels }
+        cropped(rng, frame, masks)
+    }
 }
 
-fn whole(frame: Frame, boxes: &[LabelBox]) -> Picture {
+fn whole(frame: Frame) -> (Frame, Window) {
+    let raw_size = (frame.width, frame.height);
     let size = (f64::from(frame.width), f64::from(frame.height));
     let window = Window {
         scale: 1.0,
         shift: (0.0, 0.0),
         size,
         rows: (0.0, size.1),
+        raw_first: (0, 0),
+        raw_size,
     };
-    let labels = boxes
-        .iter()
-        .filter_map(|label| window.label(label))
-        .collect();
-    Picture { frame, labels }
+    (frame, window)
 }
 
 fn letter_boxed(frame: &Frame) -> (Frame, Window) {
@@ -310,6 +256,8 @@ fn letter_boxed(frame: &Frame) -> (Frame, Window) {
             shift: (x, y),
             size: (f64::from(SIDE), f64::from(SIDE)),
             rows: (y, y + f64::from(height)),
+            raw_first: (0, 0),
+            raw_size: (frame.width, frame.height),
         },
     )
 }
@@ -326,16 +274,15 @@ fn from_rgb(picture: RgbImage) -> Frame {
 }
 
 /// Around a flame where there is one, so that few pictures are of nothing.
-fn cropped(rng: &mut ChaCha8Rng, frame: &Frame, boxes: &[LabelBox]) -> (Frame, Window) {
+fn cropped(rng: &mut ChaCha8Rng, frame: &Frame, masks: &[LabelMask]) -> (Frame, Window) {
+    let boxes: Vec<&LabelBox> = masks.iter().map(|mask| &mask.label).collect();
     let flames: Vec<&LabelBox> = boxes
         .iter()
         .filter(|label| label.class == BurningClass::Fire)
+        .copied()
         .collect();
-    let pick = if flames.is_empty() {
-        boxes.choose(rng)
-    } else {
-        flames.choose(rng).copied()
-    };
+    let pool = if flames.is_empty() { &boxes } else { &flames };
+    let pick = pool.choose(rng);
     let middle = pick.map_or(
         (0.5 * f64::from(frame.width), 0.5 * f64::from(frame.height)),
         |label| {
@@ -369,6 +316,8 @@ fn cropped(rng: &mut ChaCha8Rng, frame: &Frame, boxes: &[LabelBox]) -> (Frame, W
             shift,
             size: (f64::from(SIDE), f64::from(SIDE)),
             rows: (0.0, f64::from(SIDE)),
+            raw_first: (x, y),
+            raw_size: (SIDE, SIDE),
         },
     )
 }
@@ -599,14 +548,16 @@ mod tests {
         Rig::load(path.as_ref()).unwrap()
     }
 
+    const CUT: Form = Form {
+        framing: Framing::Cut,
+        outlines: false,
+    };
+
     #[test]
     fn the_same_seed_writes_the_same_labelled_pictures() {
         let (one, two) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
-        let summary = write(one.path(), 5, 3, &rig(), Framing::Cut).unwrap();
-        assert_eq!(
-            summary,
-            write(two.path(), 5, 3, &rig(), Framing::Cut).unwrap()
-        );
+        let summary = write(one.path(), 5, 3, &rig(), CUT).unwrap();
+        assert_eq!(summary, write(two.path(), 5, 3, &rig(), CUT).unwrap());
         assert_eq!(summary.pictures, 5);
         for number in 0..5 {
             for name in [
@@ -619,29 +570,50 @@ mod tests {
         }
     }
 
+    /// Whole frames: nothing is cut, so an outline reaches as far as its box.
     #[test]
-    fn a_label_follows_its_window_and_is_dropped_when_little_of_it_is_left() {
-        let window = Window {
-            scale: 1.0,
-            shift: (-100.0, -50.0),
-            size: (f64::from(SIDE), f64::from(SIDE)),
-            rows: (0.0, 416.0),
+    fn outlines_reach_as_far_as_boxes() {
+        let (boxes, outlines) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+        let form = |outlines| Form {
+            framing: Framing::Whole,
+            outlines,
         };
-        let label = |left_px: f64| LabelBox {
-            class: BurningClass::Fire,
-            fire: 0,
-            left_px,
-            top_px: 99.5,
-            right_px: left_px + 40.0,
-            bottom_px: 149.5,
-        };
-        let inside = window.label(&label(199.5)).unwrap();
-        assert!((inside.left * 416.0 - 100.0).abs() < 1e-9);
-        assert!((inside.bottom * 416.0 - 100.0).abs() < 1e-9);
-        assert!(
-            window.label(&label(65.0)).is_none(),
-            "a fifth of it is left"
+        let summary = write(boxes.path(), 4, 3, &rig(), form(false)).unwrap();
+        assert!(summary.fires > 0);
+        assert_eq!(
+            write(outlines.path(), 4, 3, &rig(), form(true)).unwrap(),
+            summary
         );
-        assert!(window.label(&label(80.0)).is_some(), "half of it is left");
+        let read = |dir: &Path, number: usize| {
+            std::fs::read_to_string(dir.join(format!("labels/{number:06}.txt"))).unwrap()
+        };
+        let shares = |line: &str| -> Vec<f64> {
+            let words = line.split(' ').skip(1);
+            words.map(|word| word.parse().unwrap()).collect()
+        };
+        for number in 0..4 {
+            let (of_boxes, of_outlines) =
+                (read(boxes.path(), number), read(outlines.path(), number));
+            for (boxed, outlined) in of_boxes.lines().zip(of_outlines.lines()) {
+                let [cx, cy, width, height] = shares(boxed)[..] else {
+                    panic!("{boxed}");
+                };
+                let corners = shares(outlined);
+                for (axis, middle, size) in [(0, cx, width), (1, cy, height)] {
+                    let along = corners.iter().skip(axis).step_by(2);
+                    let low = along.clone().copied().fold(f64::INFINITY, f64::min);
+                    let high = along.copied().fold(f64::NEG_INFINITY, f64::max);
+                    // Six digits are written, and boxes lie within the picture.
+                    assert!(
+                        (low.max(0.0) - (middle - 0.5 * size)).abs() < 2e-6,
+                        "{outlined}"
+                    );
+                    assert!(
+                        (high.min(1.0) - (middle + 0.5 * size)).abs() < 2e-6,
+                        "{outlined}"
+                    );
+                }
+            }
+        }
     }
 }

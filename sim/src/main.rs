@@ -3,7 +3,7 @@
 use anyhow::Context;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use emberfix_sim::autopilot::ErrorsConfig;
-use emberfix_sim::dataset::Framing;
+use emberfix_sim::dataset::{Form, Framing};
 use emberfix_sim::demo::{Demo, DemoError, Progress, Report};
 use emberfix_sim::live::{Control, Edges, LiveFlight};
 use emberfix_sim::mission::Mission;
@@ -53,6 +53,9 @@ struct FlyArgs {
     /// Whole raw left images instead of what a detector gets to see of them
     #[arg(long, requires = "dataset")]
     whole_frames: bool,
+    /// Label pixels by outlines instead of boxes
+    #[arg(long, requires = "dataset")]
+    outlines: bool,
     /// Seed instead of the mission's
     #[arg(long)]
     seed: Option<u64>,
@@ -164,7 +167,11 @@ fn fly(args: &FlyArgs, mission: &Mission) -> anyhow::Result<()> {
         } else {
             Framing::Cut
         };
-        return write_dataset(folder, args.frames, framing, mission);
+        let form = Form {
+            framing,
+            outlines: args.outlines,
+        };
+        return write_dataset(folder, args.frames, form, mission);
     }
     let errors = args.errors.of(mission);
     match &args.record {
@@ -176,10 +183,10 @@ fn fly(args: &FlyArgs, mission: &Mission) -> anyhow::Result<()> {
 fn write_dataset(
     folder: &Path,
     frames: usize,
-    framing: Framing,
+    form: Form,
     mission: &Mission,
 ) -> anyhow::Result<()> {
-    let written = dataset::write(folder, frames, mission.sim.seed, &mission.rig, framing)?;
+    let written = dataset::write(folder, frames, mission.sim.seed, &mission.rig, form)?;
     eprintln!("{}: {written:?}", folder.display());
     Ok(())
 }

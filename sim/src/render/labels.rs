@@ -23,6 +23,33 @@ pub struct LabelBox {
     pub bottom_px: f64,
 }
 
+/// A fire or smoke that the left eye sees, and its pixels: those where it holds back so much light that
+/// an annotator would call them flame or smoke. What hides a part of a flame hides that part's whole puffs.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LabelMask {
+    /// Around all of it.
+    pub label: LabelBox,
+    /// First column and row of the raster, raw left pixels.
+    first_px: (usize, usize),
+    /// Side of the raster's cells, pixels.
+    cell_px: usize,
+    columns: usize,
+    /// Row by row.
+    covered: Vec<bool>,
+}
+
+impl LabelMask {
+    /// Whether a raw left pixel (column, row) is flame or smoke.
+    #[must_use]
+    pub fn covers(&self, column: u32, row: u32) -> bool {
+        let cell = |at: u32, first: usize| Some((at as usize).checked_sub(first)? / self.cell_px);
+        let across = cell(column, self.first_px.0).filter(|across| *across < self.columns);
+        let down = cell(row, self.first_px.1);
+        let index = across.zip(down).map(|(x, y)| y * self.columns + x);
+        index.is_some_and(|index| self.covered.get(index).copied().unwrap_or(false))
+    }
+}
+
 /// Alpha from which an annotator would call a pixel flame or smoke.
 fn visible_alpha(class: BurningClass) -> f32 {
     match class {
@@ -44,7 +71,7 @@ pub(super) fn label(
     pose: &EyePose,
     lens: &Lens,
     solids: &Solids,
-) -> Option<LabelBox> {
+) -> Option<LabelMask> {
     let kept = |splat: &&Splat| splat.kind != SplatKind::Light;
     let all: Vec<(&Splat, SeenSplat)> = burning
         .splats
@@ -60,15 +87,22 @@ pub(super) fn label(
     if visible.is_empty() || (visible.len() as f64) < (1.0 - MOST_HIDDEN) * all.len() as f64 {
         return None;
     }
-    let extent = opaque_extent(&visible, world, visible_alpha(burning.class))?;
+    let raster = Raster::of(&visible, world, visible_alpha(burning.class))?;
+    let extent = raster.extent()?;
     let (width, height) = (extent.2 - extent.0, extent.3 - extent.1);
-    (width >= SMALLEST_PX && height >= SMALLEST_PX).then_some(LabelBox {
-        class: burning.class,
-        fire: burning.fire,
-        left_px: extent.0,
-        top_px: extent.1,
-        right_px: extent.2,
-        bottom_px: extent.3,
+    (width >= SMALLEST_PX && height >= SMALLEST_PX).then_some(LabelMask {
+        label: LabelBox {
+            class: burning.class,
+            fire: burning.fire,
+            left_px: extent.0,
+            top_px: extent.1,
+            right_px: extent.2,
+            bottom_px: extent.3,
+        },
+        first_px: (raster.area.left, raster.area.top),
+        cell_px: raster.step,
+        columns: raster.columns,
+        covered: raster.covered,
     })
 }
 
@@ -84,38 +118,59 @@ fn is_free(
     !behind_hill && !solids.hide(seen.tangents, 0.99 * seen.depth_m)
 }
 
-/// Edges of the pixels where the splats together hold back at least `alpha`.
-fn opaque_extent(splats: &[SeenSplat], world: &World, alpha: f32) -> Option<(f64, f64, f64, f64)> {
-    let (first, rest) = splats.split_first()?;
-    let area = rest
-        .iter()
-        .fold(first.extent, |area, splat| area.with(&splat.extent));
-    let step = (area.columns().max(area.rows()) / RASTER_PX).max(1);
-    let (columns, rows) = (area.columns().div_ceil(step), area.rows().div_ceil(step));
-    let mut clear = vec![1.0_f32; columns * rows];
-    let billows = billows(world.textures());
-    for splat in splats {
-        darken(&mut clear, columns, &area, step, splat, &billows);
+/// Where splats together hold back at least so much light, cell by cell.
+struct Raster {
+    area: PixelBox,
+    /// Side of a cell, pixels.
+    step: usize,
+    columns: usize,
+    covered: Vec<bool>,
+}
+
+impl Raster {
+    fn of(splats: &[SeenSplat], world: &World, alpha: f32) -> Option<Self> {
+        let (first, rest) = splats.split_first()?;
+        let area = rest
+            .iter()
+            .fold(first.extent, |area, splat| area.with(&splat.extent));
+        let step = (area.columns().max(area.rows()) / RASTER_PX).max(1);
+        let (columns, rows) = (area.columns().div_ceil(step), area.rows().div_ceil(step));
+        let mut clear = vec![1.0_f32; columns * rows];
+        let billows = billows(world.textures());
+        for splat in splats {
+            darken(&mut clear, columns, &area, step, splat, &billows);
+        }
+        Some(Self {
+            area,
+            step,
+            columns,
+            covered: clear.iter().map(|clear| *clear < 1.0 - alpha).collect(),
+        })
     }
-    let (mut low, mut high) = ((usize::MAX, usize::MAX), (0, 0));
-    for (k, _) in clear
-        .iter()
-        .enumerate()
-        .filter(|(_, clear)| **clear < 1.0 - alpha)
-    {
-        let (x, y) = (k % columns, k / columns);
-        low = (low.0.min(x), low.1.min(y));
-        high = (high.0.max(x + 1), high.1.max(y + 1));
+
+    /// Left, upper, right and lower edge of what is covered, pixels with centres at whole numbers.
+    fn extent(&self) -> Option<(f64, f64, f64, f64)> {
+        let (mut low, mut high) = ((usize::MAX, usize::MAX), (0, 0));
+        for (k, _) in self
+            .covered
+            .iter()
+            .enumerate()
+            .filter(|(_, covered)| **covered)
+        {
+            let (x, y) = (k % self.columns, k / self.columns);
+            low = (low.0.min(x), low.1.min(y));
+            high = (high.0.max(x + 1), high.1.max(y + 1));
+        }
+        let edge = |start: usize, cells: usize| (start + cells * self.step) as f64 - 0.5;
+        (low.0 < high.0).then(|| {
+            (
+                edge(self.area.left, low.0),
+                edge(self.area.top, low.1),
+                edge(self.area.left, high.0),
+                edge(self.area.top, high.1),
+            )
+        })
     }
-    let edge = |start: usize, cells: usize| (start + cells * step) as f64 - 0.5;
-    (low.0 < high.0).then(|| {
-        (
-            edge(area.left, low.0),
-            edge(area.top, low.1),
-            edge(area.left, high.0),
-            edge(area.top, high.1),
-        )
-    })
 }
 
 /// Takes away the light that one splat holds back.

@@ -20,7 +20,7 @@ mod splats;
 pub mod studio;
 
 pub use camera::StereoCamera;
-pub use labels::LabelBox;
+pub use labels::{LabelBox, LabelMask};
 
 use crate::state::BodyState;
 use crate::world::{Burning, Splat, World};
@@ -172,6 +172,13 @@ impl Renderer {
     /// Boxes of the fire and smoke that the left eye sees, one per fire and class.
     #[must_use]
     pub fn label_boxes(&self, body: &BodyState, t_s: f64) -> Vec<LabelBox> {
+        let masks = self.label_masks(body, t_s);
+        masks.into_iter().map(|mask| mask.label).collect()
+    }
+
+    /// The same with their pixels.
+    #[must_use]
+    pub fn label_masks(&self, body: &BodyState, t_s: f64) -> Vec<LabelMask> {
         let (lens, pose) = (
             self.camera.lens(Eye::Left),
             self.camera.pose(Eye::Left, body),
