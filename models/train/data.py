@@ -1,7 +1,8 @@
 """Pictures in memory, the mix of samples and the augmentation.
 
 Boxes are rows (class, x1, y1, x2, y2) in px of the picture they belong to. A `valid` map at
-1/8 of the canvas says where a class may be judged: bit 0 fire, bit 1 smoke.
+1/8 of the canvas says where a class may be judged: bit 0 fire, bit 1 smoke. Where masks are known, `ids`
+[h, w] has k + 1 at the pixels of box k (fire before smoke where both are), 0 elsewhere.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import torch
 from numpy.random import Generator
 from torch.utils.data import IterableDataset
 
-from . import synth
+from . import masks, synth
 
 THERMAL_SETS = ("fcdnet_thermal",)
 RGB_SETS = ("continuous_fire6", "abonia_cctv", "dfire_none99")
@@ -27,23 +28,60 @@ GREY = 114
 
 @dataclass(slots=True)
 class Picture:
-    """One decoded picture: BGR uint8 [h, w, 3], its boxes, whether smoke is labelled, its clip."""
+    """One decoded picture: BGR uint8 [h, w, 3], its boxes, whether smoke is labelled, its clip, and which
+    pixels are which box, where anything is known of that."""
 
     image: np.ndarray
     boxes: np.ndarray
     smoke: bool
     clip: str
     name: str
+    ids: np.ndarray | None = None
 
 
-def read_labels(path: Path, w: int, h: int) -> np.ndarray:
-    """YOLO text (class cx cy w h, 0..1) -> [n, 5] in px."""
-    text = path.read_text().split() if path.exists() else []
-    rows = np.array(text, np.float32).reshape(-1, 5)
-    out = rows.copy()
-    out[:, 1:3] = (rows[:, 1:3] - rows[:, 3:5] / 2) * (w, h)
-    out[:, 3:5] = (rows[:, 1:3] + rows[:, 3:5] / 2) * (w, h)
-    return out
+def read_labels(path: Path, w: int, h: int) -> tuple[np.ndarray, np.ndarray | None]:
+    """YOLO text, shares of the picture -> boxes [n, 5] in px, and `ids` where labels are outlines. A line is
+    class cx cy w h, or class x y x y ..."""
+    lines = path.read_text().splitlines() if path.exists() else []
+    rows = [np.array(line.split(), np.float32) for line in lines if line.strip()]
+    boxes, marks = [], []
+    for row in rows:
+        if len(row) == 5:
+            c, half = row[1:3], row[3:5] / 2
+            boxes.append(np.r_[row[0], (c - half) * (w, h), (c + half) * (w, h)])
+        else:
+            corners = row[1:].reshape(-1, 2) * (w, h)
+            boxes.append(np.r_[row[0], corners.min(0), corners.max(0)])
+            marks.append(masks.fill(corners, h, w))
+    boxes = np.array(boxes, np.float32).reshape(-1, 5)
+    return boxes, identify(boxes, marks, h, w) if len(marks) == len(rows) > 0 else None
+
+
+def identify(boxes: np.ndarray, marks: list[np.ndarray] | np.ndarray, h: int, w: int) -> np.ndarray:
+    """A mask per box -> `ids`; fire goes before smoke, small before large."""
+    ids = np.zeros((h, w), np.uint8)
+    area = np.prod(boxes[:, 3:] - boxes[:, 1:3], -1)
+    for k in np.lexsort((-area, -boxes[:, 0])):
+        if k < 255:
+            ids[marks[k]] = k + 1
+    return ids
+
+
+def guess_masks(p: Picture) -> None:
+    """Labelled fires get the pixels that look like flame, where colour tells: for training, no truth."""
+    if p.name.startswith("abonia"):
+        return  # loose boxes around the glow of lamps, too
+    h, w = p.image.shape[:2]
+    marks = []
+    for cls, *box in p.boxes:
+        mark = np.zeros((h, w), bool)
+        x1, y1, x2, y2 = np.clip(np.round(box), 0, (w, h, w, h)).astype(int)
+        if cls == 0 and min(x2 - x1, y2 - y1) >= 4:
+            cover = flame_cover(p.image[y1:y2, x1:x2]) > 0.4
+            if 0.08 < cover.mean() < 0.9:
+                mark[y1:y2, x1:x2] = cover
+        marks.append(mark)
+    p.ids = identify(p.boxes, marks, h, w)
 
 
 def read_split(root: Path, split: str, sets: tuple[str, ...] = RGB_SETS) -> list[Picture]:
@@ -56,18 +94,18 @@ def read_split(root: Path, split: str, sets: tuple[str, ...] = RGB_SETS) -> list
         img = cv2.imread(str(root / line))
         label = root / line.replace("/images/", "/labels/").replace(".jpg", ".txt")
         row = rows[line]
-        boxes = read_labels(label, img.shape[1], img.shape[0])
+        boxes, _ = read_labels(label, img.shape[1], img.shape[0])
         out.append(Picture(img, boxes, row["smoke_labelled"] == "yes", row["cluster"], line))
     return out
 
 
 def read_yolo(folder: Path) -> list[Picture]:
-    """A folder with images/*.jpg and labels/*.txt, both classes labelled."""
+    """A folder with images/*.jpg or *.png and labels/*.txt, both classes labelled."""
     out = []
-    for path in sorted((folder / "images").glob("*.jpg")):
+    for path in sorted(p for p in (folder / "images").iterdir() if p.suffix in (".jpg", ".png")):
         img = cv2.imread(str(path))
-        boxes = read_labels(folder / "labels" / f"{path.stem}.txt", img.shape[1], img.shape[0])
-        out.append(Picture(img, boxes, True, folder.name, f"{folder.name}/{path.name}"))
+        boxes, ids = read_labels(folder / "labels" / f"{path.stem}.txt", img.shape[1], img.shape[0])
+        out.append(Picture(img, boxes, True, folder.name, f"{folder.name}/{path.name}", ids))
     return out
 
 
@@ -75,16 +113,17 @@ def draw(count: int, seed: int, cache: Path | None = None) -> list[Picture]:
     """`count` procedural pictures; kept in `cache` (npz) between runs."""
     if cache is not None and cache.exists():
         with np.load(cache) as z:
-            images, boxes, ends = z["images"], z["boxes"], z["ends"]
+            images, boxes, ends, ids = z["images"], z["boxes"], z["ends"], z["ids"]
     else:
         scenes = [synth.scene(np.random.default_rng([seed, i])) for i in range(count)]
         images = np.stack([s[0] for s in scenes])
         boxes = np.concatenate([s[1] for s in scenes])
         ends = np.cumsum([len(s[1]) for s in scenes])
+        ids = np.stack([identify(s[1], s[2], synth.SIDE, synth.SIDE) for s in scenes])
         if cache is not None:
-            np.savez(cache, images=images, boxes=boxes, ends=ends)
+            np.savez(cache, images=images, boxes=boxes, ends=ends, ids=ids)
     parts = np.split(boxes, ends[:-1])
-    return [Picture(i, b, True, "synth", f"synth/{seed}/{k}") for k, (i, b) in enumerate(zip(images, parts))]
+    return [Picture(i, b, True, "synth", f"synth/{seed}/{k}", m) for k, (i, b, m) in enumerate(zip(images, parts, ids))]
 
 
 def letterbox(image: np.ndarray, side: int) -> tuple[np.ndarray, float, int, int]:
@@ -107,6 +146,7 @@ class Canvas:
         self.image = np.full((side, side, 3), GREY, np.uint8)
         self.boxes: list[np.ndarray] = []
         self.valid = np.full((side // 8, side // 8), 3, np.uint8)
+        self.ids = np.zeros((side, side), np.uint8)
 
     def forbid(self, box: np.ndarray, bits: int) -> None:
         """Stop judging the classes `bits` inside the box (px)."""
@@ -117,7 +157,11 @@ class Canvas:
         """Draw p scaled, its corner at (dx, dy), only inside window (x1, y1, x2, y2), all in px."""
         x1, y1, x2, y2 = window
         m = np.array([[scale, 0, dx - x1], [0, scale, dy - y1]], np.float32)
-        image = p.image
+        image, ids = p.image, np.zeros((y2 - y1, x2 - x1), np.uint8)
+        if p.ids is not None:
+            # Pixel k spans k to k + 1: its middle goes where the middle goes.
+            middle = m + np.array([[0, 0, (scale - 1) / 2]] * 2, np.float32)
+            ids = cv2.warpAffine(p.ids, middle, ids.shape[::-1], flags=cv2.INTER_NEAREST)
         if scale < 0.6:  # area-average first, so that shrinking keeps small flames clean
             image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
             m[0, 0] = m[1, 1] = 1
@@ -125,7 +169,8 @@ class Canvas:
                        cv2.BORDER_CONSTANT, (GREY, GREY, GREY))
         if not p.smoke:
             self.forbid(np.array(window, np.float32), 2)
-        for box in p.boxes:
+        new = np.zeros(256, np.uint8)
+        for k, box in enumerate(p.boxes):
             full = box[1:] * scale + (dx, dy, dx, dy)
             part = np.r_[np.maximum(full[:2], (x1, y1)), np.minimum(full[2:], (x2, y2))]
             w, h = part[2:] - part[:2]
@@ -136,6 +181,9 @@ class Canvas:
                 self.forbid(part, 1 << int(box[0]))
             else:
                 self.boxes.append(np.r_[box[0], part])
+                if k < 255 and len(self.boxes) < 256:
+                    new[k + 1] = len(self.boxes)
+        self.ids[y1:y2, x1:x2] = new[ids]
 
 
 def flame_cover(crop: np.ndarray) -> np.ndarray:
@@ -250,9 +298,11 @@ class Mixer:
             mix = np.clip(cover * 1.3, 0, 1)[..., None]
             view[:] = (view * (1 - mix) + crop * mix).astype(np.uint8)
             c.boxes.append(np.r_[0, box + (x, y, x, y)])
+            if len(c.boxes) < 256:
+                c.ids[y : y + h, x : x + w][cover > 0.4] = len(c.boxes)
 
-    def sample(self, rng: Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Picture [side, side, 3] uint8 BGR, boxes [n, 5] px, valid [side/8, side/8] uint8."""
+    def sample(self, rng: Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Picture [side, side, 3] uint8 BGR, boxes [n, 5] px, valid [side/8, side/8] uint8, ids [side, side]."""
         c = Canvas(self.side)
         match self.kinds[rng.choice(len(self.kinds), p=self.kind_p)]:
             case "extra":
@@ -272,12 +322,12 @@ class Mixer:
         if not self.visible and rng.random() < 0.5:  # white is hot: what a camera without a palette gives
             img = cv2.cvtColor(cv2.cvtColor(img, cv2.COLOR_BGR2GRAY), cv2.COLOR_GRAY2BGR)
         boxes = np.array(c.boxes, np.float32).reshape(-1, 5)
-        valid = c.valid
+        valid, ids = c.valid, c.ids
         if rng.random() < 0.5:
             # Cell (i) looks at px 8 i, so the flipped map is off by less than one cell.
-            img, valid = img[:, ::-1], valid[:, ::-1]
+            img, valid, ids = img[:, ::-1], valid[:, ::-1], ids[:, ::-1]
             boxes[:, [1, 3]] = self.side - boxes[:, [3, 1]]
-        return np.ascontiguousarray(img), boxes, np.ascontiguousarray(valid)
+        return np.ascontiguousarray(img), boxes, np.ascontiguousarray(valid), np.ascontiguousarray(ids)
 
 
 def lamps(rng: Generator, img: np.ndarray) -> None:
@@ -321,12 +371,12 @@ def photometric(rng: Generator, img: np.ndarray) -> np.ndarray:
 
 
 class Batches(IterableDataset):
-    """Endless seeded batches: images [B, 3, S, S] uint8, boxes [B, M, 5] (class -1 = none), valid."""
+    """Endless seeded batches: images [B, 3, S, S] uint8, boxes [B, M, 5] (class -1 = none), valid, ids."""
 
     def __init__(self, mixer: Mixer, batch: int, seed: int, start: int = 0) -> None:
         self.mixer, self.batch, self.seed, self.start = mixer, batch, seed, start
 
-    def __iter__(self) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
+    def __iter__(self) -> Iterator[tuple[torch.Tensor, ...]]:
         cv2.setNumThreads(0)
         info = torch.utils.data.get_worker_info()
         step, stride = self.start + (info.id if info else 0), info.num_workers if info else 1
@@ -338,5 +388,6 @@ class Batches(IterableDataset):
             for i, s in enumerate(samples):
                 boxes[i, : len(s[1])] = s[1]
             images = torch.from_numpy(np.stack([s[0] for s in samples])).permute(0, 3, 1, 2)
-            yield images, torch.from_numpy(boxes), torch.from_numpy(np.stack([s[2] for s in samples]))
+            valid, ids = (torch.from_numpy(np.stack([s[k] for s in samples])) for k in (2, 3))
+            yield images, torch.from_numpy(boxes), valid, ids
             step += stride

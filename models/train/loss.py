@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from .model import BINS, STRIDES, cells, decode
+from .model import BINS, decode
 
 NEAREST = 9  # candidates per box and level
 ANCHOR = 5.0  # side of the imagined anchor, unit: stride
@@ -36,7 +36,7 @@ def assign(boxes: Tensor, centres: Tensor, strides: Tensor) -> Tensor:
     middle = (boxes[:, :2] + boxes[:, 2:]) / 2
     gap = torch.cdist(middle, centres)
     picks = []
-    for s in STRIDES:
+    for s in strides.unique():
         level = (strides == s).nonzero()[:, 0]
         picks.append(level[gap[:, level].topk(min(NEAREST, len(level)), largest=False).indices])
     pick = torch.cat(picks, 1)  # [n, candidates]
@@ -54,17 +54,24 @@ def assign(boxes: Tensor, centres: Tensor, strides: Tensor) -> Tensor:
     return owner
 
 
-def losses(out: Tensor, boxes: Tensor, valid: Tensor, nc: int, height: int, width: int) -> dict[str, Tensor]:
-    """out [B, cells, nc + 32] with score logits, boxes [B, M, 5] px, valid [B, H/8, W/8] bit map."""
-    centres, strides = cells(height, width)
+@torch.no_grad()
+def owners(boxes: Tensor, grid: tuple[Tensor, Tensor]) -> Tensor:
+    """Boxes [B, M, 5] px -> index of the box each cell answers for [B, cells], -1 = none."""
+    return torch.stack([assign(b[b[:, 0] >= 0, 1:], *grid) for b in boxes])
+
+
+def losses(
+    out: Tensor, boxes: Tensor, valid: Tensor, nc: int, grid: tuple[Tensor, Tensor], owner: Tensor
+) -> dict[str, Tensor]:
+    """out [B, cells, nc + 32] with score logits, boxes [B, M, 5] px, valid [B, H/8, W/8] bit map, the
+    network's cells (centres and strides), and the box of each."""
+    centres, strides = grid
     judge = []
-    for s in STRIDES:
-        k = s // 8
+    for s in strides.unique():
+        k = int(s) // 8
         judge.append(valid[:, ::k, ::k].flatten(1))
     bits = torch.cat(judge, 1)
     weight = torch.stack([(bits >> c) & 1 for c in range(nc)], -1).to(out.dtype)
-    with torch.no_grad():
-        owner = torch.stack([assign(b[b[:, 0] >= 0, 1:], centres, strides) for b in boxes])
     b_at, c_at = (owner >= 0).nonzero(as_tuple=True)
     logits, target = out[..., :nc], torch.zeros_like(out[..., :nc])
     zero = out.sum() * 0

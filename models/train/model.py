@@ -42,6 +42,10 @@ class Head(nn.Module):
 class EmberNano(nn.Module):
     """Trunk (strides 2..32), path-aggregation neck with one extra level (64), a head per level."""
 
+    family = "nanodet-plus"
+    strides = STRIDES
+    within = 0.0  # of a stride from a cell's corner to where it stands
+
     def __init__(self, nc: int = len(NAMES), neck: int = 72) -> None:
         super().__init__()
         self.trunk = Trunk()
@@ -71,13 +75,14 @@ class EmberNano(nn.Module):
         return torch.cat((out[..., : self.nc].sigmoid(), out[..., self.nc :]), 2)
 
 
-def cells(height: int, width: int) -> tuple[Tensor, Tensor]:
-    """Cell centres [cells, 2] (x, y in px) and strides [cells] of an input of that size."""
+def cells(height: int, width: int, levels: tuple[int, ...] = STRIDES, within: float = 0.0) -> tuple[Tensor, Tensor]:
+    """Cell centres [cells, 2] (x, y in px) and strides [cells] of an input of that size; `levels` start at 8
+    and double."""
     centres, strides = [], []
     h, w = height // 8, width // 8
-    for s in STRIDES:
+    for s in levels:
         y, x = torch.meshgrid(torch.arange(h), torch.arange(w), indexing="ij")
-        centres.append(torch.stack((x, y), -1).reshape(-1, 2) * float(s))
+        centres.append(torch.stack((x, y), -1).reshape(-1, 2).add(within) * float(s))
         strides.append(torch.full((h * w,), float(s)))
         h, w = (h + 1) // 2, (w + 1) // 2
     return torch.cat(centres), torch.cat(strides)

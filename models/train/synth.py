@@ -1,7 +1,11 @@
 """Procedural aerial-look pictures with flames, smoke and lookalikes (domain randomisation).
 
 Every picture is SIDE x SIDE uint8 BGR. Boxes are rows of (class, x1, y1, x2, y2) in px;
-class 0 is fire, 1 is smoke. Nothing here is photographed: all of it is drawn from a seed.
+class 0 is fire, 1 is smoke; a mask [SIDE, SIDE] per box says which pixels are it. Nothing here is
+photographed: all of it is drawn from a seed.
+
+    python -m train.synth --out SHEET.png                   # a look at some
+    python -m train.synth --dataset DIR --count 200 --seed 20000   # pictures with outlines as labels
 """
 
 from __future__ import annotations
@@ -12,6 +16,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.random import Generator
+
+from . import masks
 
 SIDE = 416  # px
 # Ground colours, BGR: grass, dry grass, soil, dark soil, asphalt, concrete, forest, sand, water, burnt
@@ -143,8 +149,11 @@ def extent(cover: np.ndarray, level: float) -> np.ndarray | None:
     return None if len(xs) < 3 else np.array([xs.min(), ys.min(), xs.max() + 1, ys.max() + 1], np.float32)
 
 
-def burn(rng: Generator, img: np.ndarray, size: float) -> np.ndarray | None:
-    """Draw a fire (one or several flames side by side) about `size` px wide; returns its box."""
+Drawn = tuple[np.ndarray | None, np.ndarray]  # box, mask
+
+
+def burn(rng: Generator, img: np.ndarray, size: float) -> Drawn:
+    """Draw a fire (one or several flames side by side) about `size` px wide."""
     total = np.zeros((SIDE, SIDE), np.float32)
     at = rng.uniform(0, SIDE, 2)
     parts = int(rng.integers(1, 4)) if size > 14 else 1
@@ -169,11 +178,11 @@ def burn(rng: Generator, img: np.ndarray, size: float) -> np.ndarray | None:
         mix = (alpha * opaque)[..., None]
         img[view] = img[view] * (1 - mix) + colour[a:c, b:d] * mix * rng.uniform(0.9, 1.15)
         total[view] = np.maximum(total[view], alpha)
-    return extent(total, 0.35)
+    return extent(total, 0.35), total > 0.35
 
 
-def fume(rng: Generator, img: np.ndarray, at: np.ndarray, size: float) -> np.ndarray | None:
-    """Draw a smoke plume that drifts up from `at`; `size` px is its first radius. Returns its box."""
+def fume(rng: Generator, img: np.ndarray, at: np.ndarray, size: float) -> Drawn:
+    """Draw a smoke plume that drifts up from `at`; `size` px is its first radius."""
     clear = np.ones((SIDE, SIDE), np.float32)
     y, x = np.mgrid[:SIDE, :SIDE].astype(np.float32)
     drift = np.array([rng.uniform(-1.0, 1.0), -rng.uniform(0.5, 1.2)])
@@ -188,11 +197,12 @@ def fume(rng: Generator, img: np.ndarray, at: np.ndarray, size: float) -> np.nda
     grey = np.full(3, rng.uniform(60, 225), np.float32) * rng.uniform(0.95, 1.05, 3)
     shade = 1 + 0.08 * noise(rng, SIDE, SIDE, max(int(size), 4), 3)[..., None]
     img += cover[..., None] * (grey * shade - img)
-    return extent(cover, 0.2)
+    return extent(cover, 0.2), cover > 0.2
 
 
-def scene(rng: Generator, fires: bool | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """One picture [SIDE, SIDE, 3] uint8 and its boxes [n, 5]; fires=False draws a negative."""
+def scene(rng: Generator, fires: bool | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """One picture [SIDE, SIDE, 3] uint8, its boxes [n, 5] and masks [n, SIDE, SIDE]; fires=False draws a
+    negative."""
     img = ground(rng)
     furnish(rng, img)
     np.clip(img, 0, 255, img)
@@ -202,37 +212,57 @@ def scene(rng: Generator, fires: bool | None = None) -> tuple[np.ndarray, np.nda
         img[:line] = sky * np.linspace(1.0, 0.85, line, dtype=np.float32)[:, None, None]
     img *= rng.uniform(0.2, 0.7) if rng.random() < 0.3 else rng.uniform(0.8, 1.25)
     boxes: list[np.ndarray] = []
+    marks: list[np.ndarray] = []
     if fires or (fires is None and rng.random() < 0.65):
         for _ in range(int(rng.integers(1, 5))):
             size = float(np.exp(rng.uniform(np.log(5), np.log(110))))
             smoke_first = rng.random() < 0.5
             at = rng.uniform(0, SIDE, 2)
-            plume = None
+            plume = None, np.zeros(0)
             if rng.random() < 0.35 and smoke_first:
                 plume = fume(rng, img, at, size * rng.uniform(0.3, 0.8))
-            box = burn(rng, img, size)
-            if box is not None and plume is None and rng.random() < 0.3:
+            fire = burn(rng, img, size)
+            box = fire[0]
+            if box is not None and plume[0] is None and rng.random() < 0.3:
                 top = np.array([(box[0] + box[2]) / 2, box[1]])
                 plume = fume(rng, img, top, (box[2] - box[0]) * rng.uniform(0.3, 0.8) + 2)
-            boxes += [np.r_[c, b] for c, b in ((0, box), (1, plume)) if b is not None]
+            seen = [(c, b, m) for c, (b, m) in enumerate((fire, plume)) if b is not None]
+            boxes += [np.r_[c, b] for c, b, _ in seen]
+            marks += [m for _, _, m in seen]
     if rng.random() < 0.25:  # haze over everything
         img += rng.uniform(0.05, 0.35) * (rng.uniform(140, 220) - img)
     img += rng.uniform(0, 5) * rng.standard_normal(img.shape).astype(np.float32)
     if rng.random() < 0.5:
         img = cv2.GaussianBlur(img, (0, 0), rng.uniform(0.3, 1.2))
     out = np.clip(img, 0, 255).astype(np.uint8)
-    return out, np.array(boxes, np.float32).reshape(-1, 5)
+    return out, np.array(boxes, np.float32).reshape(-1, 5), np.array(marks, bool).reshape(-1, SIDE, SIDE)
+
+
+def write(folder: Path, count: int, seed: int) -> None:
+    """`count` pictures as a YOLO folder whose labels are outlines; the same as `data.draw` gives."""
+    for name in ("images", "labels"):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+    for k in range(count):
+        img, boxes, marks = scene(np.random.default_rng([seed, k]))
+        cv2.imwrite(str(folder / "images" / f"{k:06}.png"), img)
+        lines = [masks.label(int(box[0]), mask) for box, mask in zip(boxes, marks)]
+        (folder / "labels" / f"{k:06}.txt").write_text("".join(lines))
 
 
 def main() -> None:
-    ap = argparse.ArgumentParser(description="Write a sheet of drawn pictures to look at.")
+    ap = argparse.ArgumentParser(description="Write a sheet of drawn pictures to look at, or a data set.")
+    ap.add_argument("--dataset", type=Path, help="write labelled pictures into this folder instead")
+    ap.add_argument("--count", type=int, default=200)
     ap.add_argument("--out", type=Path, default=Path("synth.png"))
     ap.add_argument("--seed", type=int, default=0)
     args = ap.parse_args()
+    if args.dataset:
+        write(args.dataset, args.count, args.seed)
+        return
     rng = np.random.default_rng(args.seed)
     tiles = []
     for _ in range(12):
-        img, boxes = scene(rng)
+        img, boxes, _ = scene(rng)
         for c, x1, y1, x2, y2 in boxes.astype(int).tolist():
             cv2.rectangle(img, (x1, y1), (x2, y2), (255, 128, 0) if c else (0, 255, 0), 1)
         tiles.append(img)

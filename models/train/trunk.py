@@ -8,6 +8,9 @@ features, moved to where a cell's centre is index * stride.
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import onnx
 import torch
 from torch import Tensor, nn
 
@@ -70,18 +73,48 @@ class Trunk(nn.Module):
             stages.append(nn.Sequential(*blocks))
         self.stages = nn.ModuleList(stages)
 
-    def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def all(self, x: Tensor) -> list[Tensor]:
+        """Maps at strides 4, 8, 16 and 32 of 24, 40, 112 and 192 channels."""
         maps = []
         x = self.stem(x)
         for i, stage in enumerate(self.stages):
             x = stage(x)
-            if i in (2, 4, 5):
+            if i in (1, 2, 4, 5):
                 maps.append(x)
-        return maps[0], maps[1], maps[2]
+        return maps
 
-    def frozen(self) -> list[nn.Module]:
-        """Stem and the two first stages: edges and colours that need no training on few pictures."""
-        return [self.stem, self.stages[0], self.stages[1]]
+    def forward(self, x: Tensor) -> list[Tensor]:
+        return self.all(x)[1:]
+
+    def frozen(self, stages: int = 2) -> list[nn.Module]:
+        """Stem and the first stages: edges and colours that need no training on few pictures."""
+        return [self.stem, *self.stages[:stages]]
+
+    @torch.no_grad()
+    def start_from_onnx(self, path: Path, pictures: Tensor) -> None:
+        """Take the trunk out of a file of ours, whose batch norms are folded into its convolutions, and give
+        every layer its batch norm back with what `pictures` (an input, [B, 3, H, W]) show in it: the same
+        function, fit for training."""
+        graph = onnx.load(str(path)).graph
+        values = {t.name: torch.from_numpy(onnx.numpy_helper.to_array(t).copy()) for t in graph.initializer}
+        folded = [[values[name] for name in node.input[1:]] for node in graph.node if node.op_type == "Conv"]
+        layers = [m for m in self.modules() if isinstance(m, nn.Sequential) and isinstance(m[0], nn.Conv2d)]
+        seen: dict[nn.Module, tuple[Tensor, Tensor]] = {}
+        hooks = []
+        for layer, (weight, bias) in zip(layers, folded):
+            if weight.shape != layer[0].weight.shape:
+                raise ValueError(f"{path}: weights {tuple(weight.shape)}, not {tuple(layer[0].weight.shape)}")
+            layer[0].weight.copy_(weight)
+            norm = layer[1]
+            norm.running_mean.zero_(), norm.running_var.fill_(1 - norm.eps), norm.weight.fill_(1), norm.bias.copy_(bias)
+            keep = lambda _m, x, norm=norm: seen.__setitem__(norm, (x[0].mean((0, 2, 3)), x[0].var((0, 2, 3))))
+            hooks.append(norm.register_forward_pre_hook(keep))
+        self.eval()(pictures)
+        for hook in hooks:
+            hook.remove()
+        for norm, (mean, var) in seen.items():
+            norm.running_mean.copy_(mean), norm.running_var.copy_(var)
+            norm.weight.copy_((var + norm.eps).sqrt()), norm.bias.add_(mean)
 
     def start_from_imagenet(self) -> None:
         """Take the published weights over, in order; the first layer's are turned from RGB to BGR."""

@@ -80,7 +80,8 @@ def test_every_box_gets_a_cell() -> None:
 def test_masked_smoke_costs_nothing() -> None:
     out = torch.zeros(1, len(cells(64, 64)[1]), 34, requires_grad=True)
     boxes = torch.full((1, 1, 5), -1.0)
-    losses(out, boxes, torch.ones(1, 8, 8, dtype=torch.uint8), 2, 64, 64)["total"].backward()
+    owner = torch.full(out.shape[:2], -1)
+    losses(out, boxes, torch.ones(1, 8, 8, dtype=torch.uint8), 2, cells(64, 64), owner)["total"].backward()
     assert float(out.grad[..., 0].abs().min()) > 0 and float(out.grad[..., 1].abs().max()) == 0
 
 
@@ -104,6 +105,6 @@ def test_drawn_pictures_repeat_and_samples_fit() -> None:
     mixer = data.Mixer(drawn, drawn, [], 128)
     mixer.fires = drawn
     for seed in range(12):
-        image, boxes, valid = mixer.sample(np.random.default_rng(seed))
-        assert image.shape == (128, 128, 3) and valid.shape == (16, 16)
+        image, boxes, valid, ids = mixer.sample(np.random.default_rng(seed))
+        assert image.shape == (128, 128, 3) and valid.shape == (16, 16) and ids.shape == (128, 128)
         assert (boxes[:, 1:] >= 0).all() and (boxes[:, 1:] <= 128).all()
