@@ -78,7 +78,7 @@ fn boxes_and_masks_score_as_pycocotools_scores_them() {
     }
 }
 
-/// The simulator knows each flame's pixels: so many pictures that one more or less found moves little.
+/// The simulator knows each flame's pixels.
 #[test]
 fn the_shipped_masks_cover_simulated_flames() {
     if emberfix_without_runtime() {
@@ -103,7 +103,7 @@ fn the_shipped_masks_cover_simulated_flames() {
     let ours: Value = serde_json::from_str(&said.out).unwrap();
     let fire = &ours["details"]["detectors"][0]["classes"][0];
     let ap = fire["mask_ap"][0].as_f64().unwrap();
-    // Half of what the model's card says: the same flames with other masks would not reach it.
+    // About half of what the model's card says of such pictures.
     assert!(ap > 0.3, "{ap}");
 }
 
