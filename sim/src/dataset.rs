@@ -387,16 +387,21 @@ fn random_ground(rng: &mut ChaCha8Rng) -> Vec<GroundCover> {
 }
 
 fn random_light(rng: &mut ChaCha8Rng) -> LightConfig {
-    // A third of the days is overcast; some evenings are nearly dark.
+    // A third of the days is overcast; some evenings are nearly dark, on some the sun stands low and red.
     let sun = if rng.random_bool(0.33) {
         0.0
     } else {
         rng.random_range(0.3..1.1)
     };
     let dusk = rng.random_bool(0.15);
+    let evening = rng.random_bool(0.2);
     LightConfig {
         sun_azimuth_deg: rng.random_range(0.0..360.0),
-        sun_elevation_deg: rng.random_range(12.0..75.0),
+        sun_elevation_deg: if evening {
+            rng.random_range(3.0..10.0)
+        } else {
+            rng.random_range(12.0..75.0)
+        },
         sun: if dusk { 0.0 } else { sun },
         ambience: if dusk {
             rng.random_range(0.05..0.3)
@@ -447,11 +452,13 @@ fn random_smoke(rng: &mut ChaCha8Rng, k: u32) -> SmokeConfig {
 }
 
 fn random_lookalike(rng: &mut ChaCha8Rng) -> LookalikeConfig {
-    let (kind, size_m) = match rng.random_range(0..4) {
-        0 => (LookalikeKind::RedRoof, rng.random_range(5.0..14.0)),
+    let (kind, size_m) = match rng.random_range(0..6) {
+        0 => (LookalikeKind::RedRoof, rng.random_range(4.0..14.0)),
         1 => (LookalikeKind::SunGlint, rng.random_range(0.6..6.0)),
         2 => (LookalikeKind::OrangeVehicle, rng.random_range(2.5..7.0)),
-        _ => (LookalikeKind::Lantern, rng.random_range(0.1..0.5)),
+        3 => (LookalikeKind::Headlamps, rng.random_range(2.5..7.0)),
+        4 => (LookalikeKind::Fog, log_uniform(rng, 2.0, 28.0)),
+        _ => (LookalikeKind::Lantern, rng.random_range(0.1..0.7)),
     };
     let place = random_place(rng);
     LookalikeConfig {

@@ -9,7 +9,7 @@ const INNER: usize = 16;
 /// A patch holds a box and so much about it, as a share of its longer side.
 pub const MARGIN: f64 = 1.4;
 /// Boxes jitter by so much in size.
-const SCALES: [f64; 3] = [0.88, 1.0, 1.14];
+const SCALES: [f32; 3] = [0.88, 1.0, 1.14];
 /// Contrast below this is noise, grey levels squared.
 const LEAST_VARIANCE: f64 = 16.0;
 
@@ -22,75 +22,125 @@ impl Patch {
     /// there is too little contrast to tell.
     #[must_use]
     pub fn change(&self, other: &Self) -> Option<f64> {
-        let edge = (SIDE - INNER) / 2;
-        let mine = Window::of(|column, row| self.at(column + edge, row + edge));
-        if mine.squares < LEAST_VARIANCE * (INNER * INNER) as f64 {
+        let mine = Levels::of(self);
+        let inner = mine.window(EDGE, EDGE);
+        let (sum, squares) = Sums::of(&mine).about_mean(EDGE, EDGE);
+        if squares < LEAST_VARIANCE * CELLS {
             return None;
         }
-        let shifts = 0..=SIDE - INNER;
-        let alike = SCALES
-            .iter()
-            .map(|scale| other.scaled(*scale))
-            .flat_map(|other| {
-                let rows = shifts.clone();
-                let all = rows.flat_map(|down| shifts.clone().map(move |across| (across, down)));
-                all.map(|(across, down)| {
-                    mine.correlation(&Window::of(|column, row| {
-                        other.at(column + across, row + down)
-                    }))
-                })
-                .collect::<Vec<_>>()
-            });
+        let alike = SCALES.iter().map(|scale| {
+            let other = Levels::of(&other.scaled(*scale));
+            let sums = Sums::of(&other);
+            let correlation = |(across, down)| {
+                let (other_sum, other_squares) = sums.about_mean(across, down);
+                let product = f64::from(other.product(&inner, across, down));
+                let both = (squares * other_squares).sqrt().max(f64::MIN_POSITIVE);
+                (product - sum * other_sum / CELLS) / both
+            };
+            shifts().map(correlation).fold(0.0, f64::max)
+        });
         Some(1.0 - alike.fold(0.0, f64::max))
     }
 
-    fn at(&self, column: usize, row: usize) -> f64 {
-        f64::from(self.0[row * SIDE + column])
+    fn at(&self, column: usize, row: usize) -> f32 {
+        f32::from(self.0[row * SIDE + column])
     }
 
     /// The same picture, larger about its middle by a factor.
-    fn scaled(&self, factor: f64) -> Self {
-        let middle = (SIDE as f64 - 1.0) / 2.0;
-        let source = |cell: usize| {
-            ((cell as f64 - middle) / factor + middle).clamp(0.0, SIDE as f64 - 1.001)
-        };
-        let cells = std::array::from_fn(|index| {
-            let (x, y) = (source(index % SIDE), source(index / SIDE));
-            let (left, upper) = (x as usize, y as usize);
-            let (right_share, lower_share) = (x.fract(), y.fract());
+    fn scaled(&self, factor: f32) -> Self {
+        let middle = (SIDE as f32 - 1.0) / 2.0;
+        // For a column or row of the larger picture the one of this, and the share of the next.
+        let sources: [(usize, f32); SIDE] = std::array::from_fn(|cell| {
+            let source = (cell as f32 - middle) / factor + middle;
+            let source = source.clamp(0.0, SIDE as f32 - 1.001);
+            (source as usize, source.fract())
+        });
+        Self(std::array::from_fn(|index| {
+            let ((left, right_share), (upper, lower_share)) =
+                (sources[index % SIDE], sources[index / SIDE]);
             let row = |row: usize| {
                 self.at(left, row) * (1.0 - right_share) + self.at(left + 1, row) * right_share
             };
-            (row(upper) * (1.0 - lower_share) + row(upper + 1) * lower_share).round() as u8
-        });
-        Self(cells)
+            (row(upper) * (1.0 - lower_share) + row(upper + 1) * lower_share + 0.5) as u8
+        }))
     }
 }
 
-/// Part of a patch about its mean.
-struct Window {
-    values: [f64; INNER * INNER],
-    squares: f64,
+/// Cells about the part that is looked for, and how many that part has.
+const EDGE: usize = (SIDE - INNER) / 2;
+const CELLS: f64 = (INNER * INNER) as f64;
+
+/// All places of the part in another patch: cells across and down.
+fn shifts() -> impl Iterator<Item = (usize, usize)> {
+    (0..=2 * EDGE).flat_map(|down| (0..=2 * EDGE).map(move |across| (across, down)))
 }
 
-impl Window {
-    fn of(level: impl Fn(usize, usize) -> f64) -> Self {
-        let mut values: [f64; INNER * INNER] =
-            std::array::from_fn(|index| level(index % INNER, index / INNER));
-        let mean = values.iter().sum::<f64>() / values.len() as f64;
-        values.iter_mut().for_each(|value| *value -= mean);
-        let squares = values.iter().map(|value| value * value).sum();
-        Self { values, squares }
+/// Grey levels, in a type of which processors multiply many at once.
+struct Levels([[i16; SIDE]; SIDE]);
+/// Those of a part.
+type Window = [[i16; INNER]; INNER];
+
+impl Levels {
+    fn of(patch: &Patch) -> Self {
+        Self(std::array::from_fn(|row| {
+            std::array::from_fn(|column| i16::from(patch.0[row * SIDE + column]))
+        }))
     }
 
-    fn correlation(&self, other: &Self) -> f64 {
-        let product: f64 = self
-            .values
-            .iter()
-            .zip(&other.values)
-            .map(|(a, b)| a * b)
-            .sum();
-        product / (self.squares * other.squares).sqrt().max(f64::MIN_POSITIVE)
+    fn row(&self, across: usize, down: usize) -> &[i16; INNER] {
+        let row = self.0[down][across..].first_chunk();
+        row.unwrap_or(&[0; INNER])
+    }
+
+    fn window(&self, across: usize, down: usize) -> Window {
+        std::array::from_fn(|row| *self.row(across, row + down))
+    }
+
+    /// Of a part with a window; 256 products of two grey levels fit.
+    fn product(&self, window: &Window, across: usize, down: usize) -> i32 {
+        let mut sum = 0;
+        for (row, levels) in window.iter().enumerate() {
+            let row = self.row(across, row + down);
+            for column in 0..INNER {
+                sum += i32::from(levels[column]) * i32::from(row[column]);
+            }
+        }
+        sum
+    }
+}
+
+/// Sums of the grey levels, and of their squares, above and left of each corner (Crow, "Summed-area tables",
+/// 1984).
+struct Sums([[(i32, i32); SIDE + 1]; SIDE + 1]);
+
+impl Sums {
+    fn of(levels: &Levels) -> Self {
+        let mut table = [[(0, 0); SIDE + 1]; SIDE + 1];
+        for (row, levels) in levels.0.iter().enumerate() {
+            let (mut sum, mut squares) = (0, 0);
+            for (column, level) in levels.iter().enumerate() {
+                let level = i32::from(*level);
+                sum += level;
+                squares += level * level;
+                let above = table[row][column + 1];
+                table[row + 1][column + 1] = (above.0 + sum, above.1 + squares);
+            }
+        }
+        Self(table)
+    }
+
+    /// Sum over a part, and sum of the squares about its mean.
+    fn about_mean(&self, across: usize, down: usize) -> (f64, f64) {
+        let corner = |right: usize, lower: usize| self.0[down + lower][across + right];
+        let corners = [
+            corner(INNER, INNER),
+            corner(0, 0),
+            corner(INNER, 0),
+            corner(0, INNER),
+        ];
+        let of = |[a, b, c, d]: [i32; 4]| f64::from(a + b - c - d);
+        let (sum, squares) = (of(corners.map(|c| c.0)), of(corners.map(|c| c.1)));
+        (sum, squares - sum * sum / CELLS)
     }
 }
 

@@ -68,6 +68,8 @@ pub struct Seen {
     pub spread: Matrix3<f64>,
     /// Of what is new in each frame.
     pub new: Matrix3<f64>,
+    /// Disparity that the fire's own errors add to what the frame's lens says.
+    pub disparity_apart_px: f64,
 }
 
 /// Bearings further apart than this make a parallax, radians.
@@ -197,20 +199,24 @@ impl Estimate {
         let way = self.chart.way(frame.lens, &frame.known.all()) - self.flown.strayed_m;
         let by_state = self.chart.slopes(&linear, &state, frame.lens, &way);
         let rows = rows(&by_state, &linear.by_shared);
-        let apart = self.joint.mean() - self.point(frame);
+        let apart = rows * (self.joint.mean() - self.point(frame));
         Some(Seen {
-            value: linear.value + rows * apart,
+            value: linear.value + apart,
             spread: rows * self.joint.covariance() * rows.transpose(),
             new: new_in_frame(&linear.by_shared) * frame.scatter.variance(),
+            disparity_apart_px: apart.z,
         })
     }
 
-    /// What is left of a sighting of it, column, row, disparity, and whether it has the last.
+    /// Disparity that a sighting should have at its own centroid, if the camera is what all fires together
+    /// know; `None` where it has none, or none that a flame above this base could have.
     #[must_use]
-    pub fn left(&self, sighting: &Sighting, frame: &Frame<'_>) -> Option<(Vector3<f64>, bool)> {
-        let at = self.point(frame);
-        let measured = self.measure(sighting, frame, &at)?;
-        Some((self.joint.left(&measured, &at), measured.has_disparity))
+    pub fn disparity_px(&self, sighting: &Sighting, frame: &Frame<'_>) -> Option<f64> {
+        let (base, _, _) = self.chart.distant(&self.joint.fire());
+        let flame = self
+            .look(sighting, frame)
+            .flame_above(&base, sighting.disparity?.centroid)?;
+        Some(frame.lens.predict(&flame)?.disparity_px)
     }
 
     /// Takes a sighting in, linearised at what is known now. [`Estimate::solve`] does better.
@@ -294,13 +300,16 @@ impl Estimate {
         frame: &Frame<'_>,
         at: &JointVector,
     ) -> Option<Measured> {
-        let look = Look {
+        self.look(sighting, frame).measure(&self.chart, at)
+    }
+
+    fn look<'a>(&'a self, sighting: &'a Sighting, frame: &Frame<'a>) -> Look<'a> {
+        Look {
             sighting,
             lens: frame.lens,
             up: frame.view.up(),
             flown: &self.flown,
-        };
-        look.measure(&self.chart, at)
+        }
     }
 
     fn keep(&mut self, sighting: &Sighting, frame: &Frame<'_>) {

@@ -26,6 +26,8 @@ pub struct Look {
     pub is_smoke: bool,
     /// What it looks like, where its picture is at hand.
     pub patch: Option<Patch>,
+    /// Whether that is to be compared with the one before.
+    pub is_compared: bool,
     /// Light as in [`Sighting::glow`](crate::locate::Sighting::glow), where there is a measure of it.
     pub glow: Option<f64>,
     /// From the camera, metres.
@@ -104,6 +106,7 @@ impl Event {
     fn note_shape(&mut self, look: &Look) {
         let Some(patch) = look.patch else { return };
         if let Some((before, old)) = &self.last_patch
+            && look.is_compared
             && is_soon(*before, look.at)
             && let Some(change) = patch.change(old)
         {
@@ -199,6 +202,7 @@ mod tests {
             score,
             is_smoke: false,
             patch: Some(Patch(std::array::from_fn(level))),
+            is_compared: true,
             glow: Some(5000.0 * (1.0 + 0.3 * (2.7 * turn).sin())),
             range_m: 30.0,
             area_px2: 600.0,

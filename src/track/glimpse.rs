@@ -4,10 +4,10 @@ use super::assign::{Candidate, assign};
 use super::estimate::Frame;
 use super::grid::Grid;
 use super::{Classified, Fire};
-use crate::locate::{Predicted, Sighting};
+use crate::locate::Predicted;
 use emberfix_calib::Eye;
 use emberfix_frames::Vector3;
-use nalgebra::{Matrix2, Matrix3, Vector2};
+use nalgebra::{Matrix2, Matrix3};
 
 /// A fire as it should be seen, if anything sees it.
 #[derive(Debug, Clone)]
@@ -20,6 +20,8 @@ pub struct Glimpse {
     pub spread: Matrix3<f64>,
     /// Of what is new in each frame.
     pub new: Matrix3<f64>,
+    /// Disparity that the fire's own errors add to what the frame's lens says.
+    pub disparity_apart_px: f64,
     /// Pixels per metre at its depth.
     pub px_per_m: f64,
 }
@@ -57,6 +59,7 @@ pub fn all(fires: &mut [Fire], frame: &Frame<'_>) -> Vec<Glimpse> {
                 seen: seen.value,
                 spread: seen.spread,
                 new: seen.new,
+                disparity_apart_px: seen.disparity_apart_px,
                 px_per_m: focal_px / predicted.depth_m,
             });
         }
@@ -163,6 +166,10 @@ struct Fit {
 }
 
 /// How a sighting fits a fire; `None` when it lies beyond a squared distance.
+///
+/// The fire's errors are taken as linear about the base as it was glimpsed: a flame's disparity is that of its
+/// own height, and what the errors add to it that of the base. Thousands of pairs are looked at in a frame,
+/// and those that are matched are measured exactly ([`Estimate::take`](super::Estimate::take)).
 fn fit(
     glimpse: &Glimpse,
     fire: &Fire,
@@ -176,11 +183,18 @@ fn fit(
     let noise = Vector3::new(sigma_u * sigma_u, sigma_v * sigma_v, sigma_d * sigma_d)
         * frame.scatter.variance();
     let mut spread = glimpse.spread + glimpse.new + Matrix3::from_diagonal(&noise);
-    if fire.class != classified.class || bearing_distance(glimpse, sighting, &spread)? > gate {
+    let mut residual = Vector3::new(
+        sighting.base.u - glimpse.seen.x,
+        sighting.base.v - glimpse.seen.y,
+        0.0,
+    );
+    if fire.class != classified.class || bearing_distance(&residual, &spread)? > gate {
         return None;
     }
-    let (residual, has_disparity) = fire.estimate.left(sighting, frame)?;
-    if !has_disparity {
+    let expected = fire.estimate.disparity_px(sighting, frame);
+    if let Some((measured, expected)) = sighting.disparity.zip(expected) {
+        residual.z = measured.px - expected - glimpse.disparity_apart_px;
+    } else {
         spread.fixed_view_mut::<1, 3>(2, 0).fill(0.0);
         spread.fixed_view_mut::<3, 1>(0, 2).fill(0.0);
         spread[(2, 2)] = noise.z;
@@ -190,17 +204,14 @@ fn fit(
     let widening = 2.0 * factor.l().diagonal().map(f64::ln).sum() - noise.map(f64::ln).sum();
     (squared <= gate).then_some(Fit {
         squared,
-        cost: (squared <= GATE[usize::from(has_disparity)])
+        cost: (squared <= GATE[usize::from(expected.is_some())])
             .then_some(squared + widening.min(MOST_WIDENING)),
     })
 }
 
 /// Squared distance by column and row alone: with the disparity it can only grow.
-fn bearing_distance(glimpse: &Glimpse, sighting: &Sighting, spread: &Matrix3<f64>) -> Option<f64> {
-    let off = Vector2::new(
-        sighting.base.u - glimpse.seen.x,
-        sighting.base.v - glimpse.seen.y,
-    );
+fn bearing_distance(residual: &Vector3<f64>, spread: &Matrix3<f64>) -> Option<f64> {
+    let off = residual.xy();
     let spread: Matrix2<f64> = spread.fixed_view::<2, 2>(0, 0).into_owned();
     Some(off.dot(&spread.cholesky()?.solve(&off)))
 }

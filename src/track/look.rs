@@ -73,7 +73,8 @@ impl Look<'_> {
     }
 
     /// The point above the base that shows at the flame's pixel.
-    fn flame_above(&self, base: &Distant, pixel: RectifiedPixel) -> Option<Distant> {
+    #[must_use]
+    pub fn flame_above(&self, base: &Distant, pixel: RectifiedPixel) -> Option<Distant> {
         let ray = self.lens.ray_enu(pixel);
         let sight = base.at - self.lens.centre() * base.over;
         let range = range_beneath(&sight, &ray, self.up)?;

@@ -206,6 +206,8 @@ const SOLVED_LOOKS: usize = 400;
 /// would in one frame.
 const TEACHES: u32 = 4;
 const TAUGHT: u32 = 32;
+/// Pictures that are compared with those before in a frame, about; of more, each fire's only every so many looks.
+const COMPARED: usize = 128;
 /// Sightings in a row that may stray from a fire before another one begins there.
 const STRAYS: u8 = 8;
 /// Smoke this close to a fire's pixel, in its own sizes, is that fire's smoke.
@@ -460,6 +462,7 @@ impl Tracker {
         view: &View<'_>,
     ) {
         let in_doubt = self.pairs.in_doubt(&self.fires);
+        let pictured = sightings.iter().filter(|one| one.patch.is_some()).count();
         for (index, classified) in sightings.iter().enumerate() {
             if let Some(slot) = slots[index].or(new[index]) {
                 let fire = &mut self.fires[slot];
@@ -473,6 +476,7 @@ impl Tracker {
                     score: classified.score,
                     is_smoke: classified.class == AlarmClass::Smoke,
                     patch: classified.patch,
+                    is_compared: is_compared(fire.evidence.hits(), fire.id, pictured),
                     glow: sighting.glow,
                     range_m: fire.range_m,
                     area_px2: sighting.size_px.0 * sighting.size_px.1,
@@ -571,6 +575,12 @@ fn advance(fire: &mut Fire, config: &TrackConfig, is_another: bool) {
         FireState::Out if fire.evidence.is_convincing() => fire.state = FireState::Confirmed,
         _ => {}
     }
+}
+
+/// Whether a fire's picture is compared in this look, when there are so many pictures.
+fn is_compared(looks: u32, fire: FireId, pictured: usize) -> bool {
+    let every = pictured.div_ceil(COMPARED).max(1) as u32;
+    looks.wrapping_add(fire.0).is_multiple_of(every)
 }
 
 /// Azimuth of a point from the camera, radians clockwise from north.

@@ -280,7 +280,7 @@ fn classified(seen: &Seen, errors: &ErrorModel, at: ServiceTime) -> Classified {
         },
         class: AlarmClass::Fire,
         score: 0.8,
-        patch: None,
+        patch: seen.picture,
     }
 }
 

@@ -249,6 +249,7 @@ fn nothing(rng: &mut ChaCha8Rng) -> Seen {
         disparity_px: rng.random_bool(0.5).then(|| rng.random_range(1.0..20.0)),
         centroid_px: (base_px.0, base_px.1 - 0.5 * size),
         glow: 1e4 * rng.random_range(0.5..1.5),
+        picture: None,
     }
 }
 

@@ -134,6 +134,7 @@ mod tests {
             disparity_px: Some(lens.focal_px * lens.baseline_m / 10.0),
             centroid_px: (640.0, 360.0),
             glow: 1.0,
+            picture: None,
         }
     }
 

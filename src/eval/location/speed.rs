@@ -1,11 +1,16 @@
 //! What a frame costs when very much burns.
+//!
+//! Each sighting has its picture, as in flight. What is in it is drawn cell by cell: to compare two pictures
+//! costs the same whatever they show.
 
 use super::estimator::{Pilot, SetupError};
 use super::flight::{Course, Gusts, Kind};
 use super::law::{Draw, Law};
 use super::truth::{Autopilot, ErrorModel, Flame, Gnss, IMAGE_PX, Lens, Seen, Slow, TrueCamera};
+use crate::assess::patch::Patch;
 use emberfix_sim::noise::stream;
 use nalgebra::{Matrix3, Vector3};
+use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use rustix::time::{ClockId, clock_gettime};
 
@@ -78,6 +83,10 @@ impl Crowd {
         let flames = self.flames.iter();
         let seen = flames
             .filter_map(|flame| camera.see(flame, &self.errors, &mut self.boxes))
+            .map(|seen| Seen {
+                picture: Some(Patch(std::array::from_fn(|_| self.jitter.random()))),
+                ..seen
+            })
             .collect();
         CrowdLook { seen, t_s }
     }

@@ -7,6 +7,7 @@
 
 use super::flight::{Course, normal3};
 use super::law::{Draw, Law, Sines};
+use crate::assess::patch::Patch;
 use emberfix_sim::noise::normal;
 use emberfix_sim::state::BodyState;
 use nalgebra::{Matrix3, Rotation3, SVector, Vector3};
@@ -348,6 +349,8 @@ pub struct Seen {
     pub centroid_px: (f64, f64),
     /// Light of the box.
     pub glow: f64,
+    /// What it looks like, where that is drawn.
+    pub picture: Option<Patch>,
 }
 
 /// The camera that really is: true airframe, true mount, true clock.
@@ -423,6 +426,7 @@ impl TrueCamera<'_> {
             disparity_px: in_reach.then_some(sight.middle.z + dd),
             centroid_px: (sight.middle.x + cu, sight.middle.y + cv),
             glow: 1e7 * (1.0 + flicker.abs()) / (depth * depth),
+            picture: None,
         })
     }
 }

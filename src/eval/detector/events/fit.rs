@@ -67,6 +67,7 @@ mod tests {
                 burns,
                 truth: Vec::new(),
                 told: false,
+                nearest: None,
                 moments: vec![Moment {
                     hits: 8,
                     features,

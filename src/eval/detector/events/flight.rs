@@ -19,7 +19,7 @@ use emberfix_frames::{
 use emberfix_sim::noise::{GaussMarkov, normal, stream};
 use emberfix_sim::render::{Frame, LabelBox, Renderer, StereoCamera};
 use emberfix_sim::state::BodyState;
-use emberfix_sim::world::BurningClass;
+use emberfix_sim::world::{BurningClass, LookalikeKind};
 use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
 use std::collections::{BTreeMap, BTreeSet};
@@ -59,6 +59,8 @@ pub struct Tracked {
     pub truth: Vec<usize>,
     /// Whether it was told.
     pub told: bool,
+    /// The lookalike that it was placed nearest to, and how far off, metres.
+    pub nearest: Option<(LookalikeKind, f64)>,
     /// Look by look.
     pub moments: Vec<Moment>,
 }
@@ -151,7 +153,7 @@ pub fn fly(
             .collect();
         book.note(&labels, &found, tracker.fires());
     }
-    Ok(book.closed(looks as f64 / LOOKS_HZ))
+    Ok(book.closed(looks as f64 / LOOKS_HZ, &scene))
 }
 
 fn pair(frame: Frame, look: usize) -> Stamped<StereoPair> {
@@ -250,6 +252,8 @@ struct Page {
     /// Of each thing that burns.
     of: BTreeMap<usize, u32>,
     told: bool,
+    /// Where it was last.
+    position_m: Vector3<f64>,
     moments: Vec<Moment>,
 }
 
@@ -281,6 +285,7 @@ impl Book {
                 for fire in &burning {
                     *page.of.entry(*fire).or_default() += 1;
                 }
+                page.position_m = fire.position().metres();
                 page.moments.push(Moment {
                     hits: fire.evidence.hits(),
                     features: fire.event.features(),
@@ -296,8 +301,9 @@ impl Book {
         }
     }
 
-    fn closed(self, flown_s: f64) -> Flown {
-        let tracks: Vec<Tracked> = self.tracks.into_values().map(Page::closed).collect();
+    fn closed(self, flown_s: f64, scene: &Scene) -> Flown {
+        let pages = self.tracks.into_values();
+        let tracks: Vec<Tracked> = pages.map(|page| page.closed(scene)).collect();
         let there = |(fire, (visible, seen, width)): (usize, (usize, usize, f64))| There {
             fire,
             visible,
@@ -321,13 +327,14 @@ impl Book {
 }
 
 impl Page {
-    fn closed(self) -> Tracked {
+    fn closed(self, scene: &Scene) -> Tracked {
         let most = |n: u32| 2 * n > self.sightings;
         let truth = self.of.iter().filter(|(_, n)| most(**n));
         Tracked {
             burns: !most(self.wrong),
             truth: truth.map(|(fire, _)| *fire).collect(),
             told: self.told,
+            nearest: scene.nearest(&self.position_m),
             moments: self.moments,
         }
     }

@@ -204,6 +204,7 @@ fn report(options: &Options, flown: &[Flown]) -> Report {
             "false_incidents": false_incidents,
             "told_again": twice,
             "calibration": tenths,
+            "tracks": looked_at(flown),
         }),
         tables: vec![
             Table {
@@ -221,6 +222,27 @@ fn report(options: &Options, flown: &[Flown]) -> Report {
         ],
         plots: vec![("detector_events".to_owned(), calibration_plot(&tenths))],
     }
+}
+
+/// Tracks that were looked at often enough to be told: what they were, and what the model weighed in the end.
+fn looked_at(flown: &[Flown]) -> Vec<serde_json::Value> {
+    let tracks = flown.iter().enumerate();
+    let tracks =
+        tracks.flat_map(|(flight, flown)| flown.tracks.iter().map(move |one| (flight, one)));
+    tracks
+        .filter(|(_, track)| !fit::asked(track).is_empty())
+        .map(|(flight, track)| {
+            serde_json::json!({
+                "flight": flight,
+                "burns": track.burns,
+                "truth": track.truth,
+                "told": track.told,
+                "nearest": track.nearest,
+                "last": track.moments.last(),
+                "asked": fit::asked(track),
+            })
+        })
+        .collect()
 }
 
 fn calibration_table(tenths: &[Tenth]) -> Table {

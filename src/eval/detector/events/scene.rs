@@ -34,6 +34,8 @@ pub struct Scene {
     pub world: World,
     /// How the camera exposes.
     pub exposure: RenderConfig,
+    /// What looks like fire and is none.
+    pub lookalikes: Vec<LookalikeConfig>,
     range_m: f64,
     depression_rad: f64,
     start_rad: f64,
@@ -52,6 +54,7 @@ impl Scene {
         Ok(Self {
             exposure: random_exposure(rng, &config.light),
             world: World::new(&config, rng.random())?,
+            lookalikes: config.lookalikes,
             range_m,
             depression_rad: rng.random_range(20.0..55.0_f64).to_radians(),
             start_rad: rng.random_range(0.0..TAU),
@@ -59,6 +62,14 @@ impl Scene {
             closing_m_s: range_m / FLIGHT_S * rng.random_range(-0.3..0.3),
             sway,
         })
+    }
+
+    /// The lookalike that stands nearest to a place, and how far off, metres.
+    pub fn nearest(&self, place_m: &Vector3<f64>) -> Option<(LookalikeKind, f64)> {
+        let off =
+            |thing: &LookalikeConfig| (thing.east_m - place_m.x).hypot(thing.north_m - place_m.y);
+        let things = self.lookalikes.iter().map(|thing| (thing.kind, off(thing)));
+        things.min_by(|a, b| a.1.total_cmp(&b.1))
     }
 
     /// Around the middle, nearer or further, looking there as steadily as gusts let it.
