@@ -16,6 +16,9 @@ mod shared;
 mod support;
 
 use clients::Clients;
+use emberfix::locate::SharedPriors;
+use emberfix_mav::tlog::TlogReader;
+use emberfix_mav::{Telemetry, decode};
 use serde_json::Value;
 use support::{Said, Scratch};
 
@@ -139,4 +142,74 @@ fn a_bench_without_a_fix_has_no_track() {
         &ours["refused"]["null_position"], zeros,
         "each is counted by its name"
     );
+}
+
+/// Seconds since start, east and north of there (metres), velocity east and north (m/s), in flight.
+fn positions(log: &[u8]) -> Vec<(f64, [f64; 2], [f64; 2])> {
+    let decoded = TlogReader::new(log).filter_map(|record| decode(&record.frame).ok());
+    let mut first = None;
+    let mut track: Vec<(f64, [f64; 2], [f64; 2])> = Vec::new();
+    for telemetry in decoded {
+        let Telemetry::GlobalPosition(position) = telemetry else {
+            continue;
+        };
+        let start = *first.get_or_insert(position);
+        let metres_per_deg = 6_378_137.0_f64.to_radians();
+        let t_s = (position.boot.ns() - start.boot.ns()) as f64 * 1e-9;
+        let east = (position.longitude_deg - start.longitude_deg)
+            * metres_per_deg
+            * start.latitude_deg.to_radians().cos();
+        let north = (position.latitude_deg - start.latitude_deg) * metres_per_deg;
+        let [v_north, v_east, _] = position.velocity_ned_m_s.into();
+        let is_new = track.last().is_none_or(|last| t_s > last.0);
+        if is_new && v_east.hypot(v_north) > 4.0 {
+            track.push((t_s, [east, north], [v_east, v_north]));
+        }
+    }
+    track
+}
+
+/// Mean square of how far a reported way and its velocities part in so many seconds, per axis, m².
+fn parting_m2(track: &[(f64, [f64; 2], [f64; 2])], lag_s: f64) -> f64 {
+    let mut strayed = vec![(track[0].0, [0.0; 2], false)];
+    for pair in track.windows(2) {
+        let ((from_s, from, v_from), (to_s, to, v_to)) = (pair[0], pair[1]);
+        let (dt_s, last) = (to_s - from_s, strayed.last().unwrap().1);
+        let by = |axis: usize| to[axis] - from[axis] - 0.5 * dt_s * (v_from[axis] + v_to[axis]);
+        strayed.push((to_s, [last[0] + by(0), last[1] + by(1)], dt_s > 1.5));
+    }
+    let mut squares = Vec::new();
+    for (index, (at_s, from, _)) in strayed.iter().enumerate() {
+        let mut later = strayed[index + 1..].iter();
+        let unbroken = later.by_ref().take_while(|(.., broken)| !broken);
+        if let Some((_, to, _)) = unbroken.into_iter().find(|(t_s, ..)| t_s - at_s >= lag_s) {
+            squares.extend([0, 1].map(|axis| (to[axis] - from[axis]).powi(2)));
+        }
+    }
+    assert!(
+        squares.len() > 500,
+        "{} pairs over {lag_s} s",
+        squares.len()
+    );
+    squares.iter().sum::<f64>() / squares.len() as f64
+}
+
+#[test]
+fn velocity_and_position_of_a_real_flight_part_no_faster_than_assumed() {
+    let Some(log) = shared::shared_data("mavlink/cuav_2018_flight_v2.tlog") else {
+        return;
+    };
+    let track = positions(&std::fs::read(log).unwrap());
+    let priors = SharedPriors::default();
+    // A consumer receiver's share that wanders, and what its velocity strays.
+    let wanders_m2 = 1.5_f64.powi(2) * (1.0 - priors.gnss_constant_share);
+    for lag_s in [1.0, 10.0, 60.0] {
+        let kept = (-lag_s / priors.gnss_correlation_s).exp();
+        let assumed_m2 = priors.way_variance_m2_per_s() * lag_s + 2.0 * wanders_m2 * (1.0 - kept);
+        let parted_m2 = parting_m2(&track, lag_s);
+        println!("in {lag_s} s: {parted_m2:.3} m2, assumed {assumed_m2:.3}");
+        // Eleven minutes hold ten or so of the longest spans, and two axes: a variance to a third.
+        assert!(parted_m2 < 1.35 * assumed_m2, "{lag_s} s: {parted_m2} m2");
+        assert!(parted_m2 > 0.1 * assumed_m2, "{lag_s} s: {parted_m2} m2");
+    }
 }
