@@ -411,12 +411,12 @@ fn noise_that_was_understated_is_noticed_and_never_overstated_noise() {
 #[test]
 fn of_many_pictures_some_are_compared_in_each_look_and_all_in_turn() {
     let compared = |looks: u32, fires: u32| {
-        let is = |fire: &u32| super::is_compared(looks, FireId(*fire), fires as usize);
+        let is = |fire: &u32| is_compared(looks, FireId(*fire), fires as usize);
         (0..fires).filter(is).collect::<Vec<_>>()
     };
     assert_eq!(compared(3, 100).len(), 100, "few are compared always");
     let mut turns: Vec<_> = (0..8).flat_map(|looks| compared(looks, 1_000)).collect();
     turns.sort_unstable();
     assert!((0..1_000).eq(turns), "each once in eight looks");
-    assert!((0..8).all(|looks| compared(looks, 1_000).len() <= super::COMPARED));
+    assert!((0..8).all(|looks| compared(looks, 1_000).len() <= COMPARED));
 }
