@@ -274,8 +274,8 @@ fn branches_before_a_flame_do_not_draw_it_near() {
                 ..
             } = found
             else {
-                // Nothing is better than something near.
-                assert_ne!(method, Method::Best, "{found:?}");
+                // Nothing is better than something near, where hardly any of the flame is seen by both eyes.
+                assert!(method != Method::Best || bars_px > 10.0, "{found:?}");
                 continue;
             };
             let off = disparity_px - SCENE.flame_px;

@@ -159,7 +159,7 @@ fn the_default_owns_up_to_branches_and_to_flicker() {
             .iter()
             .filter_map(|round| round.said[BEST].off_sigmas());
         let off: Vec<f64> = off.collect();
-        let normalised = stats::rms(&off).unwrap();
+        let normalised = rms(&off).unwrap();
         println!("{}: {normalised:.2} of {}", case.name(), off.len());
         // It refuses few, and 24 flames scatter by 0.15 about what hundreds come to; without leaving branches
         // out it was 2.5.
