@@ -22,32 +22,37 @@ impl Patch {
     /// there is too little contrast to tell.
     #[must_use]
     pub fn change(&self, other: &Self) -> Option<f64> {
-        let mine = Levels::of(self);
+        let mine = self.scaled(1.0);
         let inner = mine.window(EDGE, EDGE);
         let (sum, squares) = Sums::of(&mine).about_mean(EDGE, EDGE);
         if squares < LEAST_VARIANCE * CELLS {
             return None;
         }
-        let alike = SCALES.iter().map(|scale| {
-            let other = Levels::of(&other.scaled(*scale));
-            let sums = Sums::of(&other);
-            let correlation = |(across, down)| {
-                let (other_sum, other_squares) = sums.about_mean(across, down);
-                let product = f64::from(other.product(&inner, across, down));
-                let both = (squares * other_squares).sqrt().max(f64::MIN_POSITIVE);
-                (product - sum * other_sum / CELLS) / both
-            };
-            shifts().map(correlation).fold(0.0, f64::max)
+        let scales = SCALES.map(|scale| {
+            let levels = other.scaled(scale);
+            (Sums::of(&levels), levels)
         });
-        Some(1.0 - alike.fold(0.0, f64::max))
-    }
-
-    fn at(&self, column: usize, row: usize) -> f32 {
-        f32::from(self.0[row * SIDE + column])
+        let correlation = |place: Place| {
+            let (sums, levels) = &scales[place.scale];
+            let (other_sum, other_squares) = sums.about_mean(place.across, place.down);
+            let product = f64::from(levels.product(&inner, place.across, place.down));
+            let both = (squares * other_squares).sqrt().max(f64::MIN_POSITIVE);
+            (product - sum * other_sum / CELLS) / both
+        };
+        let best_of = |places: Vec<Place>| {
+            let correlated = places.into_iter().map(|place| (correlation(place), place));
+            correlated.fold((0.0, Place::MIDDLE), |best, one| {
+                if one.0 > best.0 { one } else { best }
+            })
+        };
+        // Boxes are cut to a cell or two, and what is wider than a cell correlates with its neighbours too.
+        let (coarse, near) = best_of(Place::all());
+        let (fine, _) = best_of(near.beside());
+        Some(1.0 - fine.max(coarse))
     }
 
     /// The same picture, larger about its middle by a factor.
-    fn scaled(&self, factor: f32) -> Self {
+    fn scaled(&self, factor: f32) -> Levels {
         let middle = (SIDE as f32 - 1.0) / 2.0;
         // For a column or row of the larger picture the one of this, and the share of the next.
         let sources: [(usize, f32); SIDE] = std::array::from_fn(|cell| {
@@ -55,13 +60,18 @@ impl Patch {
             let source = source.clamp(0.0, SIDE as f32 - 1.001);
             (source as usize, source.fract())
         });
-        Self(std::array::from_fn(|index| {
-            let ((left, right_share), (upper, lower_share)) =
-                (sources[index % SIDE], sources[index / SIDE]);
-            let row = |row: usize| {
-                self.at(left, row) * (1.0 - right_share) + self.at(left + 1, row) * right_share
-            };
-            (row(upper) * (1.0 - lower_share) + row(upper + 1) * lower_share + 0.5) as u8
+        let (rows, _) = self.0.as_chunks::<SIDE>();
+        let wide: [[f32; SIDE]; SIDE] = std::array::from_fn(|row| {
+            sources.map(|(left, share)| {
+                let [left, right] = [left, left + 1].map(|column| f32::from(rows[row][column]));
+                left + (right - left) * share
+            })
+        });
+        Levels(sources.map(|(upper, share)| {
+            let (upper, lower) = (&wide[upper], &wide[upper + 1]);
+            std::array::from_fn(|column| {
+                (upper[column] + (lower[column] - upper[column]) * share + 0.5) as i16
+            })
         }))
     }
 }
@@ -70,9 +80,48 @@ impl Patch {
 const EDGE: usize = (SIDE - INNER) / 2;
 const CELLS: f64 = (INNER * INNER) as f64;
 
-/// All places of the part in another patch: cells across and down.
-fn shifts() -> impl Iterator<Item = (usize, usize)> {
-    (0..=2 * EDGE).flat_map(|down| (0..=2 * EDGE).map(move |across| (across, down)))
+/// Where the part may be in another patch: an index of [`SCALES`], cells across and down.
+#[derive(Clone, Copy)]
+struct Place {
+    scale: usize,
+    across: usize,
+    down: usize,
+}
+
+impl Place {
+    const MIDDLE: Self = Self {
+        scale: 1,
+        across: EDGE,
+        down: EDGE,
+    };
+
+    /// Every other cell.
+    fn all() -> Vec<Self> {
+        let every_other = || (0..=2 * EDGE).step_by(2);
+        let down = (0..SCALES.len()).flat_map(|scale| every_other().map(move |down| (scale, down)));
+        down.flat_map(|(scale, down)| {
+            every_other().map(move |across| Self {
+                scale,
+                across,
+                down,
+            })
+        })
+        .collect()
+    }
+
+    /// The cells about this one.
+    fn beside(self) -> Vec<Self> {
+        let about = |cell: usize| cell.saturating_sub(1)..=(cell + 1).min(2 * EDGE);
+        let down = about(self.down);
+        down.flat_map(|down| {
+            about(self.across).map(move |across| Self {
+                across,
+                down,
+                ..self
+            })
+        })
+        .collect()
+    }
 }
 
 /// Grey levels, in a type of which processors multiply many at once.
@@ -81,12 +130,6 @@ struct Levels([[i16; SIDE]; SIDE]);
 type Window = [[i16; INNER]; INNER];
 
 impl Levels {
-    fn of(patch: &Patch) -> Self {
-        Self(std::array::from_fn(|row| {
-            std::array::from_fn(|column| i16::from(patch.0[row * SIDE + column]))
-        }))
-    }
-
     fn row(&self, across: usize, down: usize) -> &[i16; INNER] {
         let row = self.0[down][across..].first_chunk();
         row.unwrap_or(&[0; INNER])
@@ -167,6 +210,8 @@ mod tests {
         let before = patch(blob(11.0, 12.0, 5.0));
         let after = patch(|x, y| 0.7 * blob(13.0, 10.0, 5.5)(x, y) + 20.0);
         assert!(after.change(&before).unwrap() < 0.03);
+        let after = patch(|x, y| 0.7 * blob(8.0, 15.0, 4.5)(x, y) + 20.0);
+        assert!(after.change(&before).unwrap() < 0.03, "an odd shift");
     }
 
     #[test]
