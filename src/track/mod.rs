@@ -201,13 +201,13 @@ const MISS_REACH: f64 = 1.1;
 const CLOCK_SIGMAS: f64 = 1.75;
 const LOOK_AHEAD_S: f64 = 0.6;
 /// Looks that are solved again in a frame at most, but for the last fire's.
-const SOLVED_LOOKS: usize = 400;
+const SOLVED_LOOKS: usize = 256;
 /// Every so many sightings a fire teaches what it has learned, less often where more than about [`TAUGHT`]
 /// would in one frame.
 const TEACHES: u32 = 4;
 const TAUGHT: u32 = 32;
 /// Pictures that are compared with those before in a frame, about; of more, each fire's only every so many looks.
-const COMPARED: usize = 128;
+const COMPARED: usize = 64;
 /// Sightings in a row that may stray from a fire before another one begins there.
 const STRAYS: u8 = 8;
 /// Smoke this close to a fire's pixel, in its own sizes, is that fire's smoke.
