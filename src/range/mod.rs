@@ -148,6 +148,8 @@ pub enum Refusal {
     Inconsistent,
     /// The methods contradict each other.
     Disagreement,
+    /// The eyes see other light, and the method compares light as it is.
+    OtherSpectrum,
 }
 
 impl Refusal {
@@ -167,6 +169,7 @@ impl Refusal {
             Self::BeyondInfinity => "beyond_infinity",
             Self::Inconsistent => "inconsistent",
             Self::Disagreement => "disagreement",
+            Self::OtherSpectrum => "other_spectrum",
         }
     }
 }

@@ -28,6 +28,9 @@ impl SemiGlobal {
     }
 
     pub fn find(&mut self, scene: &Scene<'_>) -> Result<Matched, Miss> {
+        if scene.cutter.two_spectra() {
+            return Err(Refusal::OtherSpectrum.into());
+        }
         let samples = self.samples(scene)?;
         let covered = samples.len() as f64 / scene.compared(0).count().max(1) as f64;
         if covered < LEAST_COVERED {
