@@ -215,7 +215,9 @@ fn fly_advised(
         let motion = |later_s: f64| Some(flight.told(0.33 * i as f64 + later_s));
         let view = View::new(&flight.rig, &reported, &PRIORS, &datum).with_motion(&motion);
         tracker.step(&view, &[seen], Some(&ground));
-        advice = tracker.advise(&tracker.fires()[0], &view);
+        if i + 1 == sightings {
+            advice = tracker.advise(&tracker.fires()[0], &view);
+        }
     }
     (tracker, flight.fire, advice)
 }
