@@ -307,7 +307,7 @@ fn median(mut values: Vec<f64>) -> f64 {
 /// peer alone: corners that used to be refused there now have a place, and its spread is that of matching.
 const BANDS: [(u32, u32, f64, f64); 3] = [
     (10, 20, 0.14, 0.12),
-    (20, 30, 0.29, 0.19),
+    (20, 30, 0.29, 0.18),
     (30, 50, 0.62, 0.62),
 ];
 /// Fewest sightings that make a corner's median its place.
