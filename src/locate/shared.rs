@@ -72,7 +72,7 @@ pub struct SharedPriors {
 
 impl Default for SharedPriors {
     /// A consumer receiver and compass. What is said of the velocity is an assumption; the one real flight it
-    /// was held against (`tests/telemetry_logs.rs`) parts from its velocities no faster.
+    /// was held against (`tests/telemetry_logs.rs`) parts from its velocities as fast, to a third.
     fn default() -> Self {
         Self {
             gnss_constant_share: 0.5,
