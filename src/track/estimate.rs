@@ -7,7 +7,7 @@ use super::look::{Look, new_in_frame, rows};
 use super::odometer::{Flown, Reading};
 use super::window::{About, CLOCK, Kept, Window};
 use crate::alarm::Method;
-use crate::locate::{Fix, Lens, Predicted, SHARED, Shot, Sighting, Terrain, View};
+use crate::locate::{Distant, Fix, Lens, Predicted, SHARED, Shot, Sighting, Terrain, View};
 use emberfix_frames::{Covariance, Matrix3, MissionEnu, Vector3};
 use nalgebra::{Matrix2, SMatrix};
 use std::collections::BTreeSet;
@@ -68,7 +68,8 @@ pub struct Seen {
     pub spread: Matrix3<f64>,
     /// Of what is new in each frame.
     pub new: Matrix3<f64>,
-    /// Disparity that the fire's own errors add to what the frame's lens says.
+    /// Its base by the frame's lens alone, and the disparity that the fire's own errors add to what that says.
+    pub base: Distant,
     pub disparity_apart_px: f64,
 }
 
@@ -204,19 +205,9 @@ impl Estimate {
             value: linear.value + apart,
             spread: rows * self.joint.covariance() * rows.transpose(),
             new: new_in_frame(&linear.by_shared) * frame.scatter.variance(),
+            base: point,
             disparity_apart_px: apart.z,
         })
-    }
-
-    /// Disparity that a sighting should have at its own centroid, if the camera is what all fires together
-    /// know; `None` where it has none, or none that a flame above this base could have.
-    #[must_use]
-    pub fn disparity_px(&self, sighting: &Sighting, frame: &Frame<'_>) -> Option<f64> {
-        let (base, _, _) = self.chart.distant(&self.joint.fire());
-        let flame = self
-            .look(sighting, frame)
-            .flame_above(&base, sighting.disparity?.centroid)?;
-        Some(frame.lens.predict(&flame)?.disparity_px)
     }
 
     /// Takes a sighting in, linearised at what is known now. [`Estimate::solve`] does better.

@@ -17,7 +17,7 @@ use emberfix_frames::ServiceTime;
 
 /// What one sighting adds.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Look {
+pub struct Look<'a> {
     /// Mid-exposure.
     pub at: ServiceTime,
     /// Detector score, 0..1.
@@ -25,7 +25,7 @@ pub struct Look {
     /// Smoke, not flame.
     pub is_smoke: bool,
     /// What it looks like, where its picture is at hand.
-    pub patch: Option<Patch>,
+    pub patch: Option<&'a Patch>,
     /// Whether that is to be compared with the one before.
     pub is_compared: bool,
     /// Light as in [`Sighting::glow`](crate::locate::Sighting::glow), where there is a measure of it.
@@ -87,7 +87,7 @@ pub struct Event {
 
 impl Event {
     /// A look that saw it.
-    pub fn saw(&mut self, look: &Look) {
+    pub fn saw(&mut self, look: &Look<'_>) {
         self.hits += 1.0;
         let score = look.score.clamp(SCORES.0, SCORES.1);
         self.scores += (score / (1.0 - score)).ln();
@@ -103,7 +103,7 @@ impl Event {
         self.misses += share;
     }
 
-    fn note_shape(&mut self, look: &Look) {
+    fn note_shape(&mut self, look: &Look<'_>) {
         let Some(patch) = look.patch else { return };
         if let Some((before, old)) = &self.last_patch
             && look.is_compared
@@ -113,10 +113,10 @@ impl Event {
             self.shape
                 .add((change.clamp(CHANGES.0, CHANGES.1) / USUAL_CHANGE).ln());
         }
-        self.last_patch = Some((look.at, patch));
+        self.last_patch = Some((look.at, *patch));
     }
 
-    fn note_light(&mut self, look: &Look) {
+    fn note_light(&mut self, look: &Look<'_>) {
         let Some(glow) = look.glow.filter(|glow| *glow > 0.0) else {
             return;
         };
@@ -185,8 +185,7 @@ mod tests {
     use emberfix_frames::SignedDuration;
 
     /// A blob; one that flickers has another shape, light and place in each look.
-    fn look(number: i64, score: f64, flickers: bool) -> Look {
-        let turn = if flickers { number as f64 } else { 0.0 };
+    fn picture(turn: f64) -> Patch {
         let (x, y) = (
             12.0 + 4.0 * (1.9 * turn).sin(),
             12.0 + 5.0 * (2.3 * turn).sin(),
@@ -197,21 +196,26 @@ mod tests {
             let squared = ((column - x).powi(2) + 0.6 * (row - y).powi(2)) / (radius * radius);
             (40.0 + 180.0 * (-squared).exp()) as u8
         };
-        Look {
+        Patch(std::array::from_fn(level))
+    }
+
+    fn see(event: &mut Event, number: i64, score: f64, flickers: bool) {
+        let turn = if flickers { number as f64 } else { 0.0 };
+        event.saw(&Look {
             at: ServiceTime::from_unix_ns(0) + SignedDuration::from_millis(400 * number),
             score,
             is_smoke: false,
-            patch: Some(Patch(std::array::from_fn(level))),
+            patch: Some(&picture(turn)),
             is_compared: true,
             glow: Some(5000.0 * (1.0 + 0.3 * (2.7 * turn).sin())),
             range_m: 30.0,
             area_px2: 600.0,
-        }
+        });
     }
 
     fn after(looks: i64, score: f64, flickers: bool) -> f64 {
         let mut event = Event::default();
-        (0..looks).for_each(|number| event.saw(&look(number, score, flickers)));
+        (0..looks).for_each(|number| see(&mut event, number, score, flickers));
         event.probability()
     }
 
@@ -226,7 +230,7 @@ mod tests {
     #[test]
     fn looks_far_apart_say_nothing_of_flicker() {
         let mut event = Event::default();
-        (0..16).for_each(|number| event.saw(&look(5 * number, 0.7, true)));
+        (0..16).for_each(|number| see(&mut event, 5 * number, 0.7, true));
         let [_, _, _, shape, flicker, ..] = event.features();
         assert_eq!((shape, flicker), (0.0, 0.0));
     }

@@ -3,8 +3,9 @@
 use super::assign::{Candidate, assign};
 use super::estimate::Frame;
 use super::grid::Grid;
+use super::look::flame_above;
 use super::{Classified, Fire};
-use crate::locate::Predicted;
+use crate::locate::{Distant, Predicted, Sighting};
 use emberfix_calib::Eye;
 use emberfix_frames::Vector3;
 use nalgebra::{Matrix2, Matrix3};
@@ -20,7 +21,8 @@ pub struct Glimpse {
     pub spread: Matrix3<f64>,
     /// Of what is new in each frame.
     pub new: Matrix3<f64>,
-    /// Disparity that the fire's own errors add to what the frame's lens says.
+    /// Its base by the frame's lens alone, and the disparity that the fire's own errors add to what that says.
+    pub base: Distant,
     pub disparity_apart_px: f64,
     /// Pixels per metre at its depth.
     pub px_per_m: f64,
@@ -59,6 +61,7 @@ pub fn all(fires: &mut [Fire], frame: &Frame<'_>) -> Vec<Glimpse> {
                 seen: seen.value,
                 spread: seen.spread,
                 new: seen.new,
+                base: seen.base,
                 disparity_apart_px: seen.disparity_apart_px,
                 px_per_m: focal_px / predicted.depth_m,
             });
@@ -188,10 +191,14 @@ fn fit(
         sighting.base.v - glimpse.seen.y,
         0.0,
     );
-    if fire.class != classified.class || bearing_distance(&residual, &spread)? > gate {
+    let is_far = |axis: usize| residual[axis] * residual[axis] > gate * spread[(axis, axis)];
+    if is_far(0) || is_far(1) || fire.class != classified.class {
         return None;
     }
-    let expected = fire.estimate.disparity_px(sighting, frame);
+    if bearing_distance(&residual, &spread)? > gate {
+        return None;
+    }
+    let expected = disparity_px(&glimpse.base, sighting, frame);
     if let Some((measured, expected)) = sighting.disparity.zip(expected) {
         residual.z = measured.px - expected - glimpse.disparity_apart_px;
     } else {
@@ -207,6 +214,14 @@ fn fit(
         cost: (squared <= GATE[usize::from(expected.is_some())])
             .then_some(squared + widening.min(MOST_WIDENING)),
     })
+}
+
+/// Disparity that a sighting should have at its own centroid above a base, if the camera is what all fires
+/// together know; `None` where it has none, or none that a flame above this base could have.
+fn disparity_px(base: &Distant, sighting: &Sighting, frame: &Frame<'_>) -> Option<f64> {
+    let pixel = sighting.disparity?.centroid;
+    let flame = flame_above(base, pixel, frame.lens, frame.view.up())?;
+    Some(frame.lens.predict(&flame)?.disparity_px)
 }
 
 /// Squared distance by column and row alone: with the disparity it can only grow.

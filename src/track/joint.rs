@@ -125,11 +125,18 @@ fn age<const N: usize>(
     for (i, drifted) in passed.drifted.iter().enumerate() {
         covariance[(from + i, from + i)] += drifted;
     }
+    // The receiver's share is left to `stray`.
+    let mut keeps = SVector::<f64, N>::repeat(1.0);
     for (i, keep) in passed.keeps.iter().enumerate().take(NEW).skip(3) {
         let at = from + CONSTANT + i;
+        keeps[at] = *keep;
         mean[at] *= keep;
-        covariance.row_mut(at).scale_mut(*keep);
-        covariance.column_mut(at).scale_mut(*keep);
+    }
+    for (mut column, keep) in covariance.column_iter_mut().zip(keeps.iter()) {
+        column.component_mul_assign(&(keeps * *keep));
+    }
+    for i in 3..NEW {
+        let (at, keep) = (from + CONSTANT + i, passed.keeps[i]);
         covariance[(at, at)] += 1.0 - keep * keep;
     }
     stray(mean, covariance, from + CONSTANT, &passed.receiver);
@@ -148,13 +155,16 @@ fn stray<const N: usize>(
     receiver: &[Strayed; 3],
 ) {
     let before = receiver.map(|axis| axis.sigmas_m.component_mul(&axis.keeps.add_scalar(-1.0)));
-    let of_two =
-        |v: &SVector<f64, N>, axis: usize| Vector2::new(v[from + axis], v[from + axis + NEW]);
-    let levers = [0, 1, 2].map(|axis| {
-        let (wanders, new) = (from + axis, from + axis + NEW);
-        covariance.column(wanders) * before[axis][0] + covariance.column(new) * before[axis][1]
-    });
-    let seen = |i: usize, j: usize| before[i].dot(&of_two(&levers[j], i));
+    let mut levers = SMatrix::<f64, N, 3>::zeros();
+    for axis in 0..3 {
+        let old = [from + axis, from + axis + NEW].map(|i| covariance.column(i));
+        levers.column_mut(axis).axpy(before[axis][0], &old[0], 0.0);
+        levers.column_mut(axis).axpy(before[axis][1], &old[1], 1.0);
+    }
+    let seen = |i: usize, j: usize| {
+        let (wanders, new) = (levers[(from + i, j)], levers[(from + i + NEW, j)]);
+        before[i].dot(&Vector2::new(wanders, new))
+    };
     let spread =
         Matrix3::from_fn(|i, j| seen(i, j) + if i == j { receiver[i].variance() } else { 0.0 });
     // Where no time has passed, nothing has changed.
@@ -162,8 +172,10 @@ fn stray<const N: usize>(
         .cholesky()
         .and_then(|factor| factor.l().try_inverse());
     let Some(whitener) = whitener else { return };
-    let left = Vector3::from_fn(|i, _| receiver[i].by_m - before[i].dot(&of_two(mean, i)));
-    let whitened = SMatrix::from_columns(&levers) * whitener.transpose();
+    let left = Vector3::from_fn(|i, _| {
+        receiver[i].by_m - before[i].dot(&Vector2::new(mean[from + i], mean[from + i + NEW]))
+    });
+    let whitened = levers * whitener.transpose();
     *mean += whitened * (whitener * left);
     subtract_squared(covariance, &whitened);
     for (axis, strayed) in receiver.iter().enumerate() {
@@ -195,19 +207,19 @@ impl Strayed {
         let (fresh, spread) = self.fresh();
         let gain = spread / self.variance();
         let moves = Matrix2::from_diagonal(&self.keeps) - gain * before.transpose();
-        let of_two = |v: &SVector<f64, N>| Vector2::new(v[at[0]], v[at[1]]);
-        let moved = moves * of_two(mean) + gain * self.by_m;
-        let columns = at.map(|i| covariance.column(i).into_owned());
-        let own = Matrix2::from_columns(&[of_two(&columns[0]), of_two(&columns[1])]);
+        let moved = moves * Vector2::new(mean[at[0]], mean[at[1]]) + gain * self.by_m;
+        let own = Matrix2::from_fn(|k, l| covariance[(at[k], at[l])]);
         let own = moves * own * moves.transpose() + Matrix2::from_diagonal(&fresh)
             - gain * spread.transpose();
-        for (k, i) in at.into_iter().enumerate() {
-            mean[i] = moved[k];
-            let column = columns[0] * moves[(k, 0)] + columns[1] * moves[(k, 1)];
-            covariance.set_column(i, &column);
-            covariance.set_row(i, &column.transpose());
+        for r in 0..N {
+            let with = moves * Vector2::new(covariance[(r, at[0])], covariance[(r, at[1])]);
+            for (k, i) in at.into_iter().enumerate() {
+                covariance[(r, i)] = with[k];
+                covariance[(i, r)] = with[k];
+            }
         }
         for (k, i) in at.into_iter().enumerate() {
+            mean[i] = moved[k];
             for (l, j) in at.into_iter().enumerate() {
                 covariance[(i, j)] = own[(k, l)];
             }
@@ -430,7 +442,7 @@ impl Joint {
     /// Returns its squared distance over the numbers that it has: 1 on average.
     pub fn take(&mut self, m: &Measured, at: &JointVector) -> Option<f64> {
         let left = self.left(m, at);
-        let lever = self.covariance * m.rows.transpose();
+        let lever = &self.covariance * m.rows.transpose();
         let spread = m.rows * lever;
         let factor = (spread + m.noise).cholesky()?;
         let squared = left.dot(&factor.solve(&left));
@@ -451,7 +463,7 @@ impl Joint {
 
     /// Takes one number in: `residual = row' (x - at) + noise`.
     pub fn take_one(&mut self, row: &JointVector, residual: f64, variance: f64, at: &JointVector) {
-        let lever = self.covariance * row;
+        let lever = &self.covariance * row;
         let spread = row.dot(&lever) + variance;
         if spread > 0.0 {
             self.mean += lever * ((residual - row.dot(&(self.mean - at))) / spread);

@@ -68,22 +68,27 @@ impl Look<'_> {
     /// Disparity of the flame, which was measured above the base: by how much, the pixels say.
     fn flame(&self, base: &Distant) -> Option<(f64, Linear)> {
         let measured = self.sighting.disparity?;
-        let flame = self.flame_above(base, measured.centroid)?;
+        let flame = flame_above(base, measured.centroid, self.lens, self.up)?;
         Some((measured.px, self.lens.linear(&flame)?))
     }
+}
 
-    /// The point above the base that shows at the flame's pixel.
-    #[must_use]
-    pub fn flame_above(&self, base: &Distant, pixel: RectifiedPixel) -> Option<Distant> {
-        let ray = self.lens.ray_enu(pixel);
-        let sight = base.at - self.lens.centre() * base.over;
-        let range = range_beneath(&sight, &ray, self.up)?;
-        let height = (ray * range - sight).dot(self.up);
-        Some(Distant {
-            at: base.at + self.up * height,
-            over: base.over,
-        })
-    }
+/// The point above a base that shows at the flame's pixel; `None` where none above it could.
+#[must_use]
+pub fn flame_above(
+    base: &Distant,
+    pixel: RectifiedPixel,
+    lens: &Lens,
+    up: &Vector3<f64>,
+) -> Option<Distant> {
+    let ray = lens.ray_enu(pixel);
+    let sight = base.at - lens.centre() * base.over;
+    let range = range_beneath(&sight, &ray, up)?;
+    let height = (ray * range - sight).dot(up);
+    Some(Distant {
+        at: base.at + up * height,
+        over: base.over,
+    })
 }
 
 /// Over the fire and the errors that last.

@@ -28,6 +28,7 @@
 
 mod advice;
 mod assign;
+mod boxes;
 mod chart;
 mod estimate;
 pub mod event;
@@ -53,6 +54,7 @@ pub use shared_errors::{Estimated, SharedErrors};
 use crate::alarm::{AlarmClass, FireId, FireState, Method, SizeM};
 use crate::assess::patch::Patch;
 use crate::locate::{Shared, Sighting, Terrain, View, fix};
+use boxes::{Crowd, contains, is_near_box};
 use emberfix_calib::RectifiedPixel;
 use emberfix_frames::{Coordinate, Covariance, Metres, MissionEnu, ServiceTime, Vector3};
 use estimate::Frame;
@@ -210,8 +212,6 @@ const TAUGHT: u32 = 32;
 const COMPARED: usize = 64;
 /// Sightings in a row that may stray from a fire before another one begins there.
 const STRAYS: u8 = 8;
-/// Smoke this close to a fire's pixel, in its own sizes, is that fire's smoke.
-const SMOKE_REACH: f64 = 0.6;
 
 impl Tracker {
     /// No fires yet; the first one gets number `first`.
@@ -379,10 +379,14 @@ impl Tracker {
         frame: &Frame<'_>,
     ) -> Vec<Option<usize>> {
         let mut new = vec![None; sightings.len()];
+        if slots.iter().all(Option::is_some) {
+            return new;
+        }
+        let crowd = Crowd::of(sightings, frame.view);
         for (index, classified) in sightings.iter().enumerate() {
             let is_free = slots[index].is_none()
                 && self.fires.len() < MAX_FIRES
-                && !self.is_explained(frame, sightings, index, slots);
+                && !self.is_explained(frame, &crowd, index, slots);
             if let Some(fire) = is_free.then(|| self.begin(classified, frame)).flatten() {
                 new[index] = Some(self.fires.len());
                 self.fires.push(fire);
@@ -419,10 +423,11 @@ impl Tracker {
     fn is_explained(
         &self,
         frame: &Frame<'_>,
-        sightings: &[Classified],
+        crowd: &Crowd<'_>,
         index: usize,
         slots: &[Option<usize>],
     ) -> bool {
+        let sightings = crowd.sightings;
         let this = &sightings[index];
         let nested = |other: usize| {
             other != index
@@ -430,7 +435,7 @@ impl Tracker {
                 && (slots[other].is_some() || other < index)
                 && contains(&sightings[other].sighting, &this.sighting)
         };
-        (0..sightings.len()).any(nested)
+        crowd.about(&this.sighting).any(nested)
             || (this.class == AlarmClass::Smoke && self.is_smoke_of_a_fire(frame, sightings, this))
     }
 
@@ -475,7 +480,7 @@ impl Tracker {
                     at: sighting.at,
                     score: classified.score,
                     is_smoke: classified.class == AlarmClass::Smoke,
-                    patch: classified.patch,
+                    patch: classified.patch.as_ref(),
                     is_compared: is_compared(fire.evidence.hits(), fire.id, pictured),
                     glow: sighting.glow,
                     range_m: fire.range_m,
@@ -617,29 +622,6 @@ fn should_be_seen(fire: &Fire, glimpse: &Glimpse, view: &View<'_>) -> bool {
         && inside(glimpse.seen.x, width)
         && inside(glimpse.seen.y, height)
         && (fire.estimate.position_m() - view.camera_enu).norm() <= MISS_REACH * fire.furthest_m
-}
-
-/// True when `outer` holds most of `inner`.
-fn contains(outer: &Sighting, inner: &Sighting) -> bool {
-    let overlap = |a: f64, a_len: f64, b: f64, b_len: f64| {
-        ((a + a_len / 2.0).min(b + b_len / 2.0) - (a - a_len / 2.0).max(b - b_len / 2.0)).max(0.0)
-    };
-    let middle = |s: &Sighting| s.base.v - s.size_px.1 / 2.0;
-    let shared = overlap(outer.base.u, outer.size_px.0, inner.base.u, inner.size_px.0)
-        * overlap(
-            middle(outer),
-            outer.size_px.1,
-            middle(inner),
-            inner.size_px.1,
-        );
-    shared > 0.5 * inner.size_px.0 * inner.size_px.1
-}
-
-fn is_near_box(sighting: &Sighting, u: f64, v: f64) -> bool {
-    let (width, height) = sighting.size_px;
-    let middle = sighting.base.v - height / 2.0;
-    (u - sighting.base.u).abs() < (0.5 + SMOKE_REACH) * width + 20.0
-        && (v - middle).abs() < (0.5 + SMOKE_REACH) * height + 20.0
 }
 
 #[cfg(test)]

@@ -104,9 +104,8 @@ impl Pairs {
 
     /// Forgets the pairs of fires that are no more.
     pub fn keep_only(&mut self, fires: &[Fire]) {
-        let ids: BTreeSet<FireId> = fires.iter().map(|fire| fire.id).collect();
-        self.log_odds
-            .retain(|(a, b), _| ids.contains(a) && ids.contains(b));
+        let is_known = |id: &FireId| fires.binary_search_by(|fire| fire.id.cmp(id)).is_ok();
+        self.log_odds.retain(|(a, b), _| is_known(a) && is_known(b));
     }
 
     fn note(&mut self, pair: (FireId, FireId), told: f64, now: ServiceTime) -> f64 {

@@ -175,6 +175,13 @@ impl Pilot {
             .collect()
     }
 
+    /// How many fires it has, those that turned out to be another one left out.
+    #[must_use]
+    pub fn open_fires(&self) -> usize {
+        let fires = self.tracker.fires().iter();
+        fires.filter(|fire| fire.merged_into.is_none()).count()
+    }
+
     /// The fires that it has, those that turned out to be another one left out.
     #[must_use]
     pub fn fires(&self) -> Vec<Told> {

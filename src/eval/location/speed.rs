@@ -117,7 +117,7 @@ pub fn step_ms(count: usize, seed: u64) -> Result<(f64, usize), SetupError> {
     }
     Ok((
         super::score::percentile(&mut times_ms, 0.5),
-        crowd.pilot.fires().len(),
+        crowd.pilot.open_fires(),
     ))
 }
 
