@@ -6,7 +6,7 @@
 //! with the flame and not by whole pixels.
 
 use super::correlate::{disparity, rival_free, there_and_back};
-use super::error::{Factors, Matched};
+use super::error::{Factors, Matched, PLAIN, Signs};
 use super::patch::{Area, Gray};
 use super::refine::Refined;
 use super::scene::{Mask, Run, Scene};
@@ -34,9 +34,12 @@ const LEAST_LIKENESS: f64 = 0.7;
 const SURE: f64 = 0.9;
 /// How its error follows from what it saw: the eyes draw the edge of brightness at other levels.
 const FACTORS: Factors = Factors {
-    scatter: 0.75,
-    unlike: 0.105,
-    least_px: 0.13,
+    scatter: 1.05,
+    dull: 3.17,
+    dull_px: 2.02,
+    unlike_width: 0.044,
+    least_px: 0.025,
+    ..PLAIN
 };
 /// Bands of rows whose scatter is the error.
 const BANDS: usize = 8;
@@ -70,10 +73,14 @@ pub(super) fn find(scene: &Scene<'_>, config: &RangeConfig) -> Result<Matched, M
         sigma_px,
         at: bright.centroid(),
     };
+    let signs = Signs {
+        dullness: dullness(&left, &right, &rimmed, best.at),
+        ..Signs::default()
+    };
     Ok(Matched {
         found: disparity(&bright, &refined),
         likeness: best.correlation,
-        dullness: 1.0,
+        signs,
         factors: &FACTORS,
     })
 }
@@ -165,6 +172,26 @@ fn bands(left: &Gray, right: &Gray, runs: &[Run], offset: i32) -> Vec<Band> {
             disparity_px: moment / mass - other_moment / other_mass,
         })
         .collect()
+}
+
+/// By what share one eye draws the edge of brightness softer than the other: the squares of their slopes.
+fn dullness(left: &Gray, right: &Gray, runs: &[Run], offset: i32) -> f64 {
+    let (mut own, mut other) = (0.0_f32, 0.0_f32);
+    for run in runs {
+        let from = run.from.max(right.seen.0 - offset).max(left.seen.0) + 1;
+        let to = run.to.min(right.seen.1 - offset).min(left.seen.1) - 1;
+        if from >= to {
+            continue;
+        }
+        let steep = |gray: &Gray, offset: i32| -> f32 {
+            let first = (from - 1 + offset - gray.area.left) as usize;
+            let line = &gray.row(run.row)[first..first + (to - from + 2) as usize];
+            line.windows(3).map(|w| (w[2] - w[0]).powi(2)).sum()
+        };
+        own += steep(left, 0);
+        other += steep(right, offset);
+    }
+    f64::from(1.0 - own.min(other) / own.max(other).max(f32::MIN_POSITIVE))
 }
 
 /// Mean disparity by mass, and its standard error from the bands' scatter.

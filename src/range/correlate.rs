@@ -1,7 +1,7 @@
 //! Matching all pixels of a target as one: normalised correlation over the whole search, then least
 //! squares below the pixel.
 
-use super::error::{Factors, Matched};
+use super::error::{Factors, Matched, PLAIN, Signs};
 use super::patch::Gray;
 use super::refine::{LEAST_ALONG, Refined, Refiner};
 use super::scene::{Mask, Run, Scene};
@@ -15,14 +15,20 @@ const OUTLINE_PX: usize = 2;
 const RIM_PX: usize = 1;
 /// How its error follows from what it saw.
 const FACTORS: Factors = Factors {
-    scatter: 0.46,
-    unlike: 0.43,
-    least_px: 0.022,
+    scatter: 0.16,
+    dull: 3.5,
+    hidden: 0.67,
+    split: 1.06,
+    rise: 0.80,
+    rise_astray: 3.46,
+    ..PLAIN
 };
 /// The same between two spectra, where grey levels are unlike anyway: a third of it is the flame's doing.
 const TWO_SPECTRA: Factors = Factors {
-    unlike: 0.14,
-    ..FACTORS
+    scatter: 0.46,
+    unlike_dull: 0.14,
+    least_px: 0.022,
+    ..PLAIN
 };
 /// Disagreement of the search there and back that is none.
 const BACK_PX: i32 = 2;
@@ -35,7 +41,7 @@ pub(super) fn find(scene: &Scene<'_>, config: &RangeConfig) -> Result<Matched, M
     if scene.flame.count() < config.min_support as usize {
         return Err(Refusal::TooSmall.into());
     }
-    let outlined = scene.flame.grown(OUTLINE_PX).runs();
+    let outlined = scene.compared(OUTLINE_PX).runs();
     let offsets = scene.search.offsets();
     let curve = correlate(&scene.left, &scene.right, &outlined, scene.every, offsets);
     let peak = rival_free(&curve, config.min_correlation, -scene.search.greatest)?;
@@ -49,7 +55,10 @@ pub(super) fn find(scene: &Scene<'_>, config: &RangeConfig) -> Result<Matched, M
     Ok(Matched {
         found: disparity(&scene.flame, &refined.found),
         likeness: likeness(&left, &right, &outlined, peak.at),
-        dullness: refined.dullness,
+        signs: Signs {
+            hidden: scene.hidden_share(),
+            ..refined.signs
+        },
         factors: if scene.two_spectra {
             &TWO_SPECTRA
         } else {

@@ -10,7 +10,7 @@
 //! with the other methods it made fewest wrong.
 
 use super::correlate::{disparity, rival_free};
-use super::error::{Factors, Matched};
+use super::error::{Factors, Matched, PLAIN, Signs};
 use super::patch::Gray;
 use super::refine::Refiner;
 use super::scene::{Run, Scene};
@@ -30,22 +30,27 @@ const LEAST_ALONG_SPECTRA: f64 = 0.1;
 
 /// How its error follows from what it saw; equal bits are few even between alike eyes.
 const FACTORS: Factors = Factors {
-    scatter: 0.80,
-    unlike: 0.022,
-    least_px: 0.02,
+    scatter: 0.30,
+    dull: 0.62,
+    unlike: 1.94,
+    hidden: 1.02,
+    split: 2.11,
+    moved_astray: 1.70,
+    ..PLAIN
 };
 /// Across two spectra: a flame's outlines are not quite the same in both.
 const ACROSS: Factors = Factors {
     scatter: 0.97,
-    unlike: 0.026,
-    ..FACTORS
+    unlike_dull: 0.026,
+    least_px: 0.02,
+    ..PLAIN
 };
 
 pub(super) fn find(scene: &Scene<'_>, config: &RangeConfig) -> Result<Matched, Miss> {
     if scene.flame.count() < config.min_support as usize {
         return Err(Refusal::TooSmall.into());
     }
-    let runs = scene.flame.grown(OUTLINE_PX).runs();
+    let runs = scene.compared(OUTLINE_PX).runs();
     let right = scene.right_whole()?;
     let curve = census_curve(&scene.left, &right, &runs, scene.search.offsets());
     let best = rival_free(&curve, LEAST_LIKENESS, -scene.search.greatest)?;
@@ -61,7 +66,10 @@ pub(super) fn find(scene: &Scene<'_>, config: &RangeConfig) -> Result<Matched, M
     Ok(Matched {
         found: disparity(&scene.flame, &refined.found),
         likeness: best.correlation,
-        dullness: refined.dullness,
+        signs: Signs {
+            hidden: scene.hidden_share(),
+            ..refined.signs
+        },
         factors: if scene.two_spectra { &ACROSS } else { &FACTORS },
     })
 }

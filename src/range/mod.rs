@@ -1,9 +1,9 @@
 //! Box to a range with its error, or why not; the only stereo use of OpenCV.
 //!
 //! **Purpose.** Finds the disparity of one target: rectifies what is around its box (`patch`), keeps
-//! the pixels that look like flame (`mask`), matches them in the right eye by each method, with the left
-//! eye's colours mixed as the right eye sees them (`scene`), and says what the error of the answer is made
-//! of (`error`).
+//! the pixels that look like flame (`mask`), leaves out what a branch before them hides (`hidden`), matches
+//! the rest in the right eye by each method, with the left eye's colours mixed as the right eye sees them
+//! (`scene`), and says what the error of the answer is made of (`error`).
 //! **In:** the decoded pair, raw, and a box in the raw left image; once per detection. **Out:**
 //! [`Ranging`]: a disparity in rectified pixels (`u_left - u_right`, positive in front), its sigma
 //! and the centroid of the pixels that it rests on, or a named reason why there is none.
@@ -19,8 +19,10 @@
 //! (`error`).
 //!
 //! **Known limits.** What is matched in smoke is the ground that shows through it (on rendered plumes at 20 m
-//! the disparity came out a quarter too small), so smoke is always [`Ranging::NoMatch`]. The sigma
-//! is that of matching alone: calibration's share stands in the rig.
+//! the disparity came out a quarter too small), so smoke is always [`Ranging::NoMatch`]. Branches are left
+//! out in the left eye, where colour tells them from ground; in the right one they are outliers.
+//! [`Method::CrossSpectral`] by itself may still follow a branch that is a pixel nearer than the flame. The
+//! sigma is that of matching alone: calibration's share stands in the rig.
 
 mod best;
 mod centroid;
@@ -29,9 +31,12 @@ mod correlate;
 mod cross_spectral;
 mod error;
 mod eyes;
+mod hidden;
 mod mask;
+mod parts;
 mod patch;
 mod pool;
+mod raster;
 mod reach;
 mod refine;
 mod scene;
@@ -143,6 +148,8 @@ pub enum Refusal {
     Inconsistent,
     /// The methods contradict each other.
     Disagreement,
+    /// The eyes see other light, and the method compares light as it is.
+    OtherSpectrum,
 }
 
 impl Refusal {
@@ -162,6 +169,7 @@ impl Refusal {
             Self::BeyondInfinity => "beyond_infinity",
             Self::Inconsistent => "inconsistent",
             Self::Disagreement => "disagreement",
+            Self::OtherSpectrum => "other_spectrum",
         }
     }
 }

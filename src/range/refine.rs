@@ -4,12 +4,11 @@
 //! Large targets are halved until they have a few thousand pixels: a flame is smooth on the scale of its
 //! own size, what shines through it from behind is not. Both eyes pass the same filters, a binomial one and
 //! a cubic B-spline, so that neither noise nor the fraction of the pixel leans the answer to one side.
-//!
-//! A flame is as deep as it is wide, so near ones have no single disparity. The parts' disparities are
-//! pooled as a random-effects mean: as far as the parts truly differ each counts alike, as far as they
-//! only differ by noise the sharper one counts more. Their scatter is the error that the mean states.
 
+use super::error::Signs;
+use super::parts::pooled;
 use super::patch::{Area, Gray};
+use super::raster::{Weights, averaged, counted, plane, smoothed};
 use nalgebra::{Matrix3, Vector3};
 use std::ops::Range;
 
@@ -27,15 +26,7 @@ pub(super) struct Refined {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Refinement {
     pub found: Refined,
-    /// By what share one eye is duller than the other, 0 to 1.
-    pub dullness: f64,
-}
-
-/// How much each pixel of an area counts, 0 to 1.
-#[derive(Debug, Clone, PartialEq)]
-pub(super) struct Weights {
-    pub area: Area,
-    pub values: Vec<f32>,
+    pub signs: Signs,
 }
 
 /// Both eyes, smoothed alike, about one whole disparity, on a raster of `pixel_px` pixels.
@@ -116,7 +107,8 @@ impl Refiner {
     pub fn refine(&self, least_along: f64) -> Option<Refinement> {
         let whole = self.together()?;
         let parts = self.parts(&whole);
-        if ((parts.len() * PART * PART) as f64) < least_along * self.counted() {
+        let along = (parts.len() * PART * PART) as f64 / self.counted();
+        if along < least_along {
             return None;
         }
         let found = pooled(&parts).unwrap_or(Refined {
@@ -133,7 +125,14 @@ impl Refiner {
                     self.origin.1 + found.at.1 * self.pixel_px,
                 ),
             },
-            dullness: self.dullness(whole.state.y),
+            signs: Signs {
+                dullness: self.dullness(whole.state.y),
+                split_px: (found.disparity_px - whole.state.x).abs() * self.pixel_px,
+                rise_px: self.rise(&whole).abs() * self.pixel_px,
+                astray: (1.0 - along).max(0.0),
+                moved_px: whole.state.x.abs() * self.pixel_px,
+                ..Signs::default()
+            },
         })
     }
 
@@ -180,6 +179,7 @@ impl Refiner {
             whole = Some(Whole {
                 state,
                 scale,
+                normal: sums.normal(),
                 sigma: scale * WITNESS_FACTOR * inverse[(0, 0)].max(0.0).sqrt(),
                 at: sums.at(),
             });
@@ -238,6 +238,60 @@ impl Refiner {
             total.take(&lanes, &moments, row);
         }
         total
+    }
+
+    /// By how much the right eye shows lower what the left one shows, on the raster. Eyes that are rectified and
+    /// see the same moment show nothing lower: what burns rises between two moments.
+    fn rise(&self, whole: &Whole) -> f64 {
+        let at = Between::new(-whole.state.x);
+        let [gain, offset] = [whole.state.y as f32, whole.state.z as f32];
+        let cut = (1.0 / (TUKEY * whole.scale)) as f32;
+        let tile = self.everything();
+        let mut total = [0.0_f64; RISE_TERMS];
+        for row in tile.rows.clone() {
+            let mut lanes = [[0.0_f32; LANES]; RISE_TERMS];
+            for first in tile.lanes(&self.counting[row]) {
+                let here = row * self.width + first;
+                let left = &self.left[here - 1..here + LANES + 1];
+                let above = &self.left[here - self.width..here - self.width + LANES];
+                let below = &self.left[here + self.width..here + self.width + LANES];
+                let right = here.saturating_add_signed(at.whole);
+                let right = &self.right[right..right + LANES + 3];
+                let weights = &self.weight[here..here + LANES];
+                for k in 0..LANES {
+                    let value = dot(&at.value, &right[k..k + 4]);
+                    let slope = dot(&at.slope, &right[k..k + 4]);
+                    let own = (left[k] + 4.0 * left[k + 1] + left[k + 2]) / 6.0;
+                    let residual = own - gain * value - offset;
+                    let x = residual * cut;
+                    let kept = (1.0 - x * x).max(0.0);
+                    let shift = -0.5 * (gain * slope + 0.5 * (left[k + 2] - left[k]));
+                    let down = 0.5 * (below[k] - above[k]);
+                    let by_down = weights[k] * kept * kept * down;
+                    lanes[0][k] += by_down * shift;
+                    lanes[1][k] += by_down * value;
+                    lanes[2][k] += by_down;
+                    lanes[3][k] += by_down * down;
+                    lanes[4][k] += by_down * residual;
+                }
+            }
+            for (total, lane) in total.iter_mut().zip(&lanes) {
+                *total += f64::from(lane.iter().sum::<f32>());
+            }
+        }
+        let [shift, value, one, down, pull] = total;
+        // The others have had their way: what is left of the pull is for the rise alone.
+        let beside = Vector3::new(shift, value, one);
+        let taken = whole
+            .normal
+            .try_inverse()
+            .map_or(0.0, |inverse| beside.dot(&(inverse * beside)));
+        let own = down - taken;
+        if own > LEAST_STEEP * down {
+            pull / own
+        } else {
+            0.0
+        }
     }
 
     /// Residuals of what counts, one place in two.
@@ -335,6 +389,8 @@ fn counting(weights: &[f32]) -> Range<usize> {
 /// What all pixels together say, on the raster.
 struct Whole {
     state: State,
+    /// Normal equations about it.
+    normal: Matrix3<f64>,
     /// Robust standard deviation of the residuals, grey levels.
     scale: f64,
     sigma: f64,
@@ -347,6 +403,10 @@ const SETTLED: usize = 3;
 const TUKEY: f64 = 4.685;
 /// Terms of the normal equations and of their right side.
 const TERMS: usize = 9;
+/// Of down with shift, value, 1, itself, and its pull.
+const RISE_TERMS: usize = 5;
+/// Least share of the slopes down that nothing else explains, to tell a rise by.
+const LEAST_STEEP: f64 = 0.05;
 /// Grey level that is taken off before squaring, so that single precision is enough.
 const MIDDLE: f32 = 128.0;
 
@@ -407,86 +467,6 @@ const PART_REACH: f64 = 1.0;
 pub(super) const LEAST_ALONG: f64 = 0.25;
 /// Parts that know no more than this count for nothing.
 const WORST_PART: f64 = 1.0;
-/// Fewer parts than this have no scatter to speak of.
-const FEWEST_PARTS: usize = 4;
-/// Parts farther than this many sigmas from the rest are not flame but what is behind or before it.
-const OUTLIER_SIGMAS: f64 = 3.0;
-/// How much a disparity may change from row to row, one sigma: what stands upright before a camera that
-/// looks down.
-const TILT: f64 = 0.006;
-
-/// Random-effects mean of the parts, less their common slope over rows: between-part scatter as the
-/// median of absolute deviations, which what is behind the flame does not widen.
-fn pooled(parts: &[Refined]) -> Option<Refined> {
-    if parts.len() < FEWEST_PARTS {
-        return None;
-    }
-    let middle = |value: fn(&Refined) -> f64| median(parts.iter().map(value).collect());
-    let noise = middle(|found| found.sigma_px)?;
-    let mut line = Line {
-        mean: middle(|found| found.disparity_px)?,
-        slope: 0.0,
-        row: middle(|found| found.at.1)?,
-    };
-    let mut found = None;
-    for _ in 0..5 {
-        let off = parts.iter().map(|part| line.off(part).abs());
-        let spread = 1.4826 * median(off.collect())?;
-        let between = (spread.powi(2) - noise.powi(2)).max(0.0);
-        found = line.through(parts, between);
-    }
-    found
-}
-
-/// A disparity at a row and its change from row to row.
-struct Line {
-    mean: f64,
-    slope: f64,
-    row: f64,
-}
-
-impl Line {
-    fn off(&self, part: &Refined) -> f64 {
-        part.disparity_px - self.mean - self.slope * (part.at.1 - self.row)
-    }
-
-    /// The line that fits the parts near this one, and what it says of their middle.
-    fn through(&mut self, parts: &[Refined], between: f64) -> Option<Refined> {
-        let weighed: Vec<(f64, &Refined)> = parts
-            .iter()
-            .map(|part| (part.sigma_px.powi(2) + between, part))
-            .filter(|(variance, part)| self.off(part).powi(2) < OUTLIER_SIGMAS.powi(2) * variance)
-            .map(|(variance, part)| (1.0 / variance, part))
-            .collect();
-        let sum = |value: &dyn Fn(&Refined) -> f64| -> f64 {
-            let weighted = |(weight, part): &(f64, &Refined)| weight * value(part);
-            weighed.iter().map(weighted).sum()
-        };
-        let w = sum(&|_| 1.0);
-        let (column, row) = (sum(&|part| part.at.0) / w, sum(&|part| part.at.1) / w);
-        let mean = sum(&|part| part.disparity_px) / w;
-        let rows = sum(&|part| (part.at.1 - row).powi(2)) + TILT.powi(-2);
-        let slope = sum(&|part| (part.at.1 - row) * (part.disparity_px - mean)) / rows;
-        *self = Self { mean, slope, row };
-        let squares: f64 = weighed
-            .iter()
-            .map(|(weight, part)| (weight * self.off(part)).powi(2))
-            .sum();
-        let n = weighed.len() as f64;
-        let scattered = (squares * n / (n - 1.0)).max(w).sqrt() / w;
-        (weighed.len() > 1 && scattered.is_finite()).then_some(Refined {
-            disparity_px: mean,
-            sigma_px: scattered,
-            at: (column, row),
-        })
-    }
-}
-
-fn median(mut values: Vec<f64>) -> Option<f64> {
-    let middle = values.len() / 2;
-    (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f64::total_cmp).1)
-}
-
 /// The cubic B-spline's value and slope at a fixed shift; whole and fraction are the same for all pixels.
 struct Between {
     whole: isize,
@@ -516,116 +496,6 @@ impl Between {
             slope: slope.map(|weight| weight as f32),
         }
     }
-}
-
-/// The least area with all that counts, and how many pixels count.
-fn counted(weights: &Weights) -> Option<(Area, usize)> {
-    let area = &weights.area;
-    let (mut least, mut most) = ((i32::MAX, i32::MAX), (i32::MIN, i32::MIN));
-    let mut counted = 0;
-    for (row, line) in (area.top..).zip(weights.values.chunks_exact(area.width().max(1))) {
-        let first = line.iter().position(|weight| *weight > 0.0);
-        let last = line.iter().rposition(|weight| *weight > 0.0);
-        if let (Some(first), Some(last)) = (first, last) {
-            counted += line.iter().filter(|weight| **weight > 0.0).count();
-            least = (least.0.min(area.left + first as i32), least.1.min(row));
-            most = (most.0.max(area.left + last as i32), row);
-        }
-    }
-    (counted > 0).then_some((
-        Area {
-            left: least.0,
-            top: least.1,
-            right: most.0 + 1,
-            bottom: most.1 + 1,
-        },
-        counted,
-    ))
-}
-
-impl Weights {
-    /// Over another area; nothing counts outside of the columns that are seen.
-    fn over(&self, area: Area, seen: &Range<i32>) -> Vec<f32> {
-        let mut values = vec![0.0; area.width() * area.height()];
-        let from = area.left.max(self.area.left).max(seen.start);
-        let to = area.right.min(self.area.right).min(seen.end);
-        for row in area.top.max(self.area.top)..area.bottom.min(self.area.bottom) {
-            if from < to {
-                let there = (row - self.area.top) as usize * self.area.width();
-                let there = there + (from - self.area.left) as usize;
-                let here = (row - area.top) as usize * area.width();
-                let here = here + (from - area.left) as usize;
-                let count = (to - from) as usize;
-                values[here..here + count].copy_from_slice(&self.values[there..there + count]);
-            }
-        }
-        values
-    }
-}
-
-/// An area of an image, read `shift` columns further on; its edges repeat.
-fn plane(image: &Gray, area: Area, shift: i32) -> Vec<f32> {
-    let (first, last) = (image.area.left - shift, image.area.right - 1 - shift);
-    let mut values = Vec::with_capacity(area.width() * area.height());
-    for row in area.top..area.bottom {
-        let line = image.row(row.clamp(image.area.top, image.area.bottom - 1));
-        let inside = area.left.max(first)..area.right.min(last + 1);
-        if inside.is_empty() {
-            let edge = if area.left > last { line.len() - 1 } else { 0 };
-            values.resize(values.len() + area.width(), line[edge]);
-            continue;
-        }
-        values.resize(values.len() + (inside.start - area.left) as usize, line[0]);
-        values.extend_from_slice(
-            &line[(inside.start - first) as usize..(inside.end - first) as usize],
-        );
-        values.resize(
-            values.len() + (area.right - inside.end) as usize,
-            line[line.len() - 1],
-        );
-    }
-    values
-}
-
-/// Means of squares of `side` pixels.
-fn averaged(plane: Vec<f32>, width: usize, side: usize) -> Vec<f32> {
-    if side == 1 {
-        return plane;
-    }
-    let wide = width / side;
-    let share = 1.0 / (side * side) as f32;
-    let mut means = vec![0.0; plane.len() / (side * side)];
-    for (row, line) in plane.chunks_exact(width).enumerate() {
-        let means = &mut means[row / side * wide..][..wide];
-        for (mean, square) in means.iter_mut().zip(line.chunks_exact(side)) {
-            *mean += share * square.iter().sum::<f32>();
-        }
-    }
-    means
-}
-
-/// Through the binomial filter 1 2 1 in both directions, edges repeated: what an interpolation gets wrong
-/// lies above its cut-off, and so does much noise.
-fn smoothed(plane: &[f32], width: usize) -> Vec<f32> {
-    let height = plane.len() / width;
-    let mut across = Vec::with_capacity(plane.len());
-    for line in plane.chunks_exact(width) {
-        across.push(0.25 * (3.0 * line[0] + line[1]));
-        across.extend(line.windows(3).map(|w| 0.25 * (w[0] + 2.0 * w[1] + w[2])));
-        across.push(0.25 * (line[width - 2] + 3.0 * line[width - 1]));
-    }
-    let mut both = Vec::with_capacity(plane.len());
-    for row in 0..height {
-        let line = |row: usize| &across[row * width..(row + 1) * width];
-        let (above, here, below) = (
-            line(row.saturating_sub(1)),
-            line(row),
-            line((row + 1).min(height - 1)),
-        );
-        let mixed = above.iter().zip(here).zip(below);
-        both.extend(mixed.map(|((a, h), b)| 0.25 * (a + 2.0 * h + b)));
-    }
-    both
 }
 
 /// Standard deviation of the bulk, from the median of absolute residuals.
@@ -665,6 +535,18 @@ mod tests {
         }
     }
 
+    /// Blots instead of slanted waves, so that right and down are told apart.
+    fn lowered(down: f64) -> Gray {
+        let value = |k: i32| {
+            let (u, v) = (f64::from(k % 60), f64::from(k / 60) - down);
+            (120.0 + 50.0 * (0.5 * u).sin() * (0.45 * v).cos() + 30.0 * (0.8 * u).cos()) as f32
+        };
+        Gray {
+            values: (0..60 * 20).map(value).collect(),
+            ..wave(0.0)
+        }
+    }
+
     fn weights() -> Weights {
         let inside = |k: usize| (20..50).contains(&(k % 60));
         Weights {
@@ -694,6 +576,18 @@ mod tests {
     }
 
     #[test]
+    fn what_the_right_eye_shows_lower_is_told_and_level_eyes_tell_nothing() {
+        let rise = |down: f64| {
+            let lower = lowered(down);
+            let refiner = Refiner::new(&lowered(0.0), &lower, &weights(), 0).unwrap();
+            refiner.refine(LEAST_ALONG).unwrap().signs.rise_px
+        };
+        assert!(rise(0.0) < 0.01, "{}", rise(0.0));
+        // One step from where they are level: a tenth off at a third of a pixel.
+        assert!((rise(0.3) - 0.3).abs() < 0.05, "{}", rise(0.3));
+    }
+
+    #[test]
     fn a_flat_eye_has_no_disparity() {
         let flat = Gray {
             values: vec![80.0; 60 * 20],
@@ -701,23 +595,5 @@ mod tests {
         };
         let refiner = Refiner::new(&flat, &flat, &weights(), 5).unwrap();
         assert_eq!(refiner.refine(LEAST_ALONG), None);
-    }
-
-    #[test]
-    fn parts_behind_the_flame_do_not_count_and_scatter_is_stated() {
-        let part = |disparity_px| Refined {
-            disparity_px,
-            sigma_px: 0.02,
-            at: (1.0, 2.0),
-        };
-        let mut parts: Vec<Refined> = (0..9)
-            .map(|k| part(5.0 + 0.01 * f64::from(k % 3)))
-            .collect();
-        let tight = pooled(&parts).unwrap();
-        parts.extend([part(3.0), part(3.1)]);
-        let found = pooled(&parts).unwrap();
-        assert!((found.disparity_px - 5.01).abs() < 0.01, "{found:?}");
-        let wide: Vec<Refined> = (0..9).map(|k| part(5.0 + 0.3 * f64::from(k % 3))).collect();
-        assert!(pooled(&wide).unwrap().sigma_px > 5.0 * tight.sigma_px);
     }
 }

@@ -1,8 +1,9 @@
 //! What all methods look at: one target's surroundings in both eyes, and which pixels are flame.
 
 use super::error::{Matched, Sigma};
+use super::hidden::hidden;
 use super::patch::{Area, Colour, Cutter, Gray, LUMA};
-use super::refine::Weights;
+use super::raster::Weights;
 use super::search::rows_apart;
 use super::{Miss, RangeConfig, RangeError, RawPair, Refusal, Target};
 use crate::detect::DetectionClass;
@@ -147,6 +148,8 @@ pub(super) struct Scene<'a> {
     pub right_gray: &'a Mat,
     /// The flame, over the box and its context.
     pub flame: Mask,
+    /// What something thin and dark hides of it, and a little around.
+    pub hidden: Option<Mask>,
     /// How far each of its pixels outshines the surroundings, 0 to 1: the less, the more shows through.
     pub shine: Vec<f32>,
     pub search: Search,
@@ -177,7 +180,7 @@ impl<'a> Scene<'a> {
         let context = config.context_px as i32;
         let around = area.grown(context, context, context);
         let colour = cutter.left(&pair.left_bgr, around)?;
-        let (flame, shine) = flame(&colour, &area, config);
+        let (flame, shine, hidden) = flame(&colour, &area, config);
         let every = rows_apart(&flame.runs());
         let near = nearby(&area);
         let strip = search.strip(&near);
@@ -193,6 +196,7 @@ impl<'a> Scene<'a> {
             every,
             right_gray,
             flame,
+            hidden,
             shine,
             search,
             two_spectra: cutter.two_spectra(),
@@ -208,10 +212,27 @@ impl<'a> Scene<'a> {
         matched.sigma(width_px, depth_px.abs() / self.cutter.focal_px())
     }
 
+    /// How much is hidden, against the flame.
+    pub fn hidden_share(&self) -> f64 {
+        let hidden = self.hidden.as_ref().map_or(0, Mask::count);
+        hidden as f64 / self.flame.count().max(1) as f64
+    }
+
+    /// The flame and so much about it, without what is hidden.
+    pub fn compared(&self, reach: usize) -> Mask {
+        let mut compared = self.flame.grown(reach);
+        if let Some(hidden) = &self.hidden {
+            for (kept, hidden) in compared.kept.iter_mut().zip(&hidden.kept) {
+                *kept &= !hidden;
+            }
+        }
+        compared
+    }
+
     /// How much the pixels about the flame count: as they outshine what is behind, and a little where
     /// they do not.
     pub fn weights(&self, reach: usize) -> Weights {
-        let kept = self.flame.grown(reach).kept;
+        let kept = self.compared(reach).kept;
         let weight = |(kept, shine): (&bool, &f32)| if *kept { shine.max(FAINTEST) } else { 0.0 };
         Weights {
             area: self.flame.area,
@@ -320,11 +341,14 @@ fn nearby(target: &Area) -> Area {
 /// The flame's pixels in the box and how far they outshine the surroundings: those that the gate keeps
 /// and that outshine them at all. Where that leaves too few (dry grass is as yellow as flame), what the
 /// gate keeps; where that is too little as well (a thing in colours that the gate does not know), all
-/// of them, and all alike.
-fn flame(left: &Colour, target: &Area, config: &RangeConfig) -> (Mask, Vec<f32>) {
+/// of them, and all alike. Then what hides some of them, which only those that shine can tell.
+fn flame(left: &Colour, target: &Area, config: &RangeConfig) -> (Mask, Vec<f32>, Option<Mask>) {
     let area = left.area;
     let shines: Vec<i16> = left.bgr.iter().map(|pixel| shine(*pixel)).collect();
-    let floor = brightness_around(&shines, &area, target);
+    let Around {
+        bright: floor,
+        dark,
+    } = brightness_around(&shines, &area, target);
     let width = area.width();
     let inside = (target.left - area.left).max(0) as usize..(target.right - area.left) as usize;
     let rows = (target.top - area.top).max(0) as usize
@@ -346,22 +370,21 @@ fn flame(left: &Colour, target: &Area, config: &RangeConfig) -> (Mask, Vec<f32>)
         |kept: &[bool]| kept.iter().filter(|kept| **kept).count() >= config.min_support as usize;
     if enough(&shining) {
         let excess = excess(&shines, &shining, floor);
-        return (
-            Mask {
-                area,
-                kept: shining,
-            },
-            excess,
-        );
+        let mask = Mask {
+            area,
+            kept: shining,
+        };
+        let hidden = hidden(&mask, &shines, dark, target);
+        return (mask, excess, hidden);
     }
     let alike = vec![1.0; shines.len()];
     if enough(&gate) {
-        return (Mask { area, kept: gate }, alike);
+        return (Mask { area, kept: gate }, alike, None);
     }
     for row in rows {
         gate[row * width + inside.start..row * width + inside.end.min(width)].fill(true);
     }
-    (Mask { area, kept: gate }, alike)
+    (Mask { area, kept: gate }, alike, None)
 }
 
 /// Shine beyond the floor, 1 for what shines as brightly as most of the flame.
@@ -383,8 +406,18 @@ fn shine(bgr: [u8; 3]) -> i16 {
     2 * i16::from(bgr[2]) - i16::from(bgr[0])
 }
 
-/// Shine that hardly anything around the target exceeds.
-fn brightness_around(shines: &[i16], area: &Area, target: &Area) -> i16 {
+/// What the surroundings of a target shine like.
+struct Around {
+    /// Hardly anything there exceeds this.
+    bright: i16,
+    /// What shows through a gap of the flame is mostly brighter than this.
+    dark: i16,
+}
+
+/// Percent of the surroundings that are darker than what counts as dark.
+const DARK_PERCENT: usize = 25;
+
+fn brightness_around(shines: &[i16], area: &Area, target: &Area) -> Around {
     let mut around = Vec::with_capacity(shines.len());
     for (row, line) in (area.top..).zip(shines.chunks_exact(area.width().max(1))) {
         if (target.top..target.bottom).contains(&row) {
@@ -397,8 +430,14 @@ fn brightness_around(shines: &[i16], area: &Area, target: &Area) -> i16 {
         }
     }
     if around.is_empty() {
-        return -256;
+        return Around {
+            bright: -256,
+            dark: -256,
+        };
     }
     let rank = around.len() * 95 / 100;
-    *around.select_nth_unstable(rank).1
+    let bright = *around.select_nth_unstable(rank).1;
+    let rank = around.len() * DARK_PERCENT / 100;
+    let dark = *around.select_nth_unstable(rank).1;
+    Around { bright, dark }
 }

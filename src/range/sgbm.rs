@@ -1,6 +1,6 @@
 //! Semi-global matching per pixel in the padded box, pooled under the flame's mask (P3, P4).
 
-use super::error::{Factors, Matched};
+use super::error::{Factors, Matched, PLAIN, Signs};
 use super::patch::Gray;
 use super::pool::{Pooled, Sample, pool};
 use super::scene::{Mask, Scene, Search};
@@ -28,8 +28,11 @@ impl SemiGlobal {
     }
 
     pub fn find(&mut self, scene: &Scene<'_>) -> Result<Matched, Miss> {
+        if scene.cutter.two_spectra() {
+            return Err(Refusal::OtherSpectrum.into());
+        }
         let samples = self.samples(scene)?;
-        let covered = samples.len() as f64 / scene.flame.count().max(1) as f64;
+        let covered = samples.len() as f64 / scene.compared(0).count().max(1) as f64;
         if covered < LEAST_COVERED {
             return Err(Refusal::Inconsistent.into());
         }
@@ -44,7 +47,7 @@ impl SemiGlobal {
         borne_out(scene, &samples, &pooled, config)?;
         let found = Disparity {
             px: pooled.disparity_px,
-            sigma_px: UNSETTLED_PX * (1.0 - pooled.agreement),
+            sigma_px: UNSETTLED_PX * (1.0 - pooled.agreement).powi(2),
             support: pooled.support,
             centroid: RectifiedPixel {
                 u: pooled.centroid.0,
@@ -54,7 +57,10 @@ impl SemiGlobal {
         Ok(Matched {
             found,
             likeness: 1.0,
-            dullness: 0.0,
+            signs: Signs {
+                hidden: scene.hidden_share(),
+                ..Signs::default()
+            },
             factors: &FACTORS,
         })
     }
@@ -70,7 +76,7 @@ impl SemiGlobal {
         let invalid = (self.search.least - 1) * 16;
         let seen = f64::from(scene.right.seen.0)..f64::from(scene.right.seen.1);
         let mut samples = Vec::new();
-        for (column, row) in pixels(&scene.flame) {
+        for (column, row) in pixels(&scene.compared(0)) {
             let at = (row - strip.top, column - strip.left);
             let sixteenths = i32::from(*disparities.at_2d::<i16>(at.0, at.1)?);
             let disparity_px = f64::from(sixteenths) / 16.0;
@@ -87,12 +93,13 @@ impl SemiGlobal {
 
 /// Pixels of error, one sigma, if no two pixels agreed. Neighbours share their errors, so that the spread
 /// of those that agree says little; how many do not agree says more.
-const UNSETTLED_PX: f64 = 1.7;
+const UNSETTLED_PX: f64 = 6.3;
 /// How its error follows from that: whole pixels pull at its disparities, whatever agrees.
 const FACTORS: Factors = Factors {
-    scatter: 0.98,
-    unlike: 0.0,
-    least_px: 0.118,
+    scatter: 1.05,
+    hidden_px: 0.09,
+    least_px: 0.119,
+    ..PLAIN
 };
 /// Share of the flame that must have a valid disparity: where less has, the eyes show it differently.
 const LEAST_COVERED: f64 = 0.5;

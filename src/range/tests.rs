@@ -240,6 +240,63 @@ fn every_way_finds_the_flame_and_says_that_it_did() {
     }
 }
 
+/// Slanted dark bars at twice the flame's disparity, drawn over both eyes.
+fn barred(mut pair: RawPair, disparity_px: f64) -> RawPair {
+    let right = pair.right_gray.as_mut().unwrap();
+    for v in 0..HEIGHT {
+        for u in 0..WIDTH {
+            let dark = |u: f64| {
+                let bar = |from: f64, slope: f64| (u - from - slope * f64::from(v)).abs() < 2.5;
+                bar(120.0, 0.55) || bar(235.0, -0.6) || bar(165.0, 0.3)
+            };
+            if dark(f64::from(u)) {
+                *pair.left_bgr.at_2d_mut::<Vec3b>(v, u).unwrap() = Vec3b::all(20);
+            }
+            if dark(f64::from(u) + disparity_px) {
+                *right.at_2d_mut::<u8>(v, u).unwrap() = 20;
+            }
+        }
+    }
+    pair
+}
+
+/// Bars are sharper than the flame behind them: whoever compares grey levels without leaving them out
+/// follows them.
+#[test]
+fn branches_before_a_flame_do_not_draw_it_near() {
+    for method in [Method::Sgbm, Method::Correlate, Method::Best] {
+        for bars_px in [6.5, 8.0, 11.0] {
+            let pair = barred(SCENE.pair(), bars_px);
+            let found = ranger(method).range(&pair, &SCENE.target()).unwrap();
+            let Ranging::Measured {
+                disparity_px,
+                sigma_px,
+                ..
+            } = found
+            else {
+                // Nothing is better than something near, where hardly any of the flame is seen by both eyes.
+                assert!(method != Method::Best || bars_px > 10.0, "{found:?}");
+                continue;
+            };
+            let off = disparity_px - SCENE.flame_px;
+            println!(
+                "{} bars at {bars_px}: {off:+.3} +- {sigma_px:.3} px",
+                method.name()
+            );
+            assert!(
+                off.abs() < 3.0 * sigma_px,
+                "{}: {off} +- {sigma_px}",
+                method.name()
+            );
+            assert!(
+                off < 0.2 * (bars_px - SCENE.flame_px),
+                "{}: {off}",
+                method.name()
+            );
+        }
+    }
+}
+
 /// What a near-infrared eye makes of it: bright where the visible one is dark.
 #[test]
 fn the_cross_spectral_way_survives_reversed_contrast_and_grey_levels_do_not() {

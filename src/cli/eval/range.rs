@@ -10,7 +10,7 @@ pub struct RangeArguments {
     #[arg(long, default_value_t = 1)]
     seed: u64,
     /// Flames at each distance.
-    #[arg(long, default_value_t = 20, value_parser = clap::value_parser!(u16).range(2..=1000))]
+    #[arg(long, default_value_t = 60, value_parser = clap::value_parser!(u16).range(2..=1000))]
     repeats: u16,
     /// A few flames only: seconds instead of minutes, and coarse figures.
     #[arg(long)]

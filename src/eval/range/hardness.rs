@@ -1,13 +1,14 @@
 //! What each method does with flames that are hard to range.
 
 use super::cases::Hardness;
-use super::outcome::{BEST, Bench, FULL_FRAME, NAMES, Round, Said, Verdict};
+use super::outcome::{BEST, Bench, FULL_FRAME, NAMES, OURS, Round, Said, Verdict};
 use super::stage::{RigName, Stage};
 use super::stats::rms;
 use super::tables::rounds;
 use super::{Options, RangeEvalError, Tick};
 use crate::eval::Table;
 use emberfix_sim::world::World;
+use std::ops::Range;
 use std::sync::Arc;
 
 /// One case's rounds.
@@ -26,6 +27,8 @@ pub(super) struct Count {
     pub refused: usize,
     pub phantom_near: usize,
     pub other_wrong: usize,
+    /// Disparities, weak ones too.
+    pub answered: usize,
     /// Root mean square of error over stated sigma, of weak disparities too.
     pub normalised_error: Option<f64>,
 }
@@ -44,7 +47,7 @@ pub(super) fn measure(
     let suite = |(k, case): (usize, &Hardness)| {
         let count = match case {
             // Its figure is a share of one in a hundred.
-            Hardness::SaturatedCore => 5 * options.hard_repeats(),
+            Hardness::SaturatedCore => 3 * options.hard_repeats(),
             _ => options.hard_repeats(),
         };
         let mut all = Vec::new();
@@ -76,6 +79,7 @@ impl Suite {
         Count {
             case: self.case,
             method: NAMES[method],
+            answered: sigmas.len(),
             normalised_error: rms(&sigmas),
             of: self.rounds.len(),
             right,
@@ -111,31 +115,69 @@ impl Suite {
     }
 }
 
-/// The table for people: how many right / refused / phantom near / other wrong.
-pub(super) fn drawn(suites: &[Suite]) -> Table {
-    let mut header = vec!["case".to_owned(), "rounds".to_owned()];
-    header.extend(NAMES.map(str::to_owned));
-    header.push(format!("{}: error / sigma", NAMES[BEST]));
-    let row = |suite: &Suite| {
-        let mut row = vec![suite.case.name().to_owned(), suite.rounds.len().to_string()];
-        row.extend(suite.counts().iter().map(|count| {
-            let Count {
-                right,
-                refused,
-                phantom_near,
-                other_wrong,
-                ..
-            } = count;
-            format!("{right} / {refused} / {phantom_near} / {other_wrong}")
-        }));
-        let normalised = suite.count(BEST).normalised_error;
-        row.push(normalised.map_or("-".to_owned(), |value| format!("{value:.2}")));
-        row
+/// The normalised error that is the farthest from 1 of some methods over all cases, and the answers that it
+/// rests on; cases with fewer than `fewest` answers are no measurement.
+pub(super) fn least_honest(
+    suites: &[Suite],
+    methods: Range<usize>,
+    fewest: usize,
+) -> (Option<f64>, usize) {
+    let counts = suites.iter().flat_map(Suite::counts);
+    let wanted: Vec<&str> = NAMES[methods].to_vec();
+    let told = counts
+        .filter(|count| count.answered >= fewest && wanted.contains(&count.method))
+        .filter_map(|count| Some((count.normalised_error?, count.answered)));
+    let far = |value: f64| value.ln().abs();
+    let farthest = told.max_by(|a, b| far(a.0).total_cmp(&far(b.0)));
+    farthest.map_or((None, 0), |(value, n)| (Some(value), n))
+}
+
+/// The tables for people: how many right / refused / phantom near / other wrong, and whether sigmas are true.
+pub(super) fn drawn(suites: &[Suite]) -> [Table; 2] {
+    let header = |names: &[&str]| -> Vec<String> {
+        let first = ["case", "rounds"];
+        first.iter().chain(names).map(|s| (*s).to_owned()).collect()
     };
-    Table {
-        title: "Hard flames, 75 and 120 mm: right within 3 sigma / refused / phantom near / other wrong"
-            .to_owned(),
-        header,
-        rows: suites.iter().map(row).collect(),
-    }
+    let row = |suite: &Suite, methods: usize, cell: &dyn Fn(&Count) -> String| -> Vec<String> {
+        let first = [suite.case.name().to_owned(), suite.rounds.len().to_string()];
+        let counts = suite.counts();
+        let cells = counts.iter().take(methods).map(cell);
+        first.into_iter().chain(cells).collect()
+    };
+    let verdicts = |count: &Count| {
+        let Count {
+            right,
+            refused,
+            phantom_near,
+            other_wrong,
+            ..
+        } = count;
+        format!("{right} / {refused} / {phantom_near} / {other_wrong}")
+    };
+    let honesty = |count: &Count| match count.normalised_error {
+        Some(value) => format!(
+            "{value:.2} ({:.0} %)",
+            100.0 * count.answered as f64 / count.of.max(1) as f64
+        ),
+        None => "-".to_owned(),
+    };
+    let rows = |methods: usize, cell: &dyn Fn(&Count) -> String| -> Vec<Vec<String>> {
+        suites
+            .iter()
+            .map(|suite| row(suite, methods, cell))
+            .collect()
+    };
+    [
+        Table {
+            title: "Hard flames, 75 and 120 mm: right within 3 sigma / refused / phantom near / other wrong"
+                .to_owned(),
+            header: header(&NAMES),
+            rows: rows(NAMES.len(), &verdicts),
+        },
+        Table {
+            title: "Hard flames: error over sigma, root mean square (share that has a disparity)".to_owned(),
+            header: header(&NAMES[..OURS]),
+            rows: rows(OURS, &honesty),
+        },
+    ]
 }

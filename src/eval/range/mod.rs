@@ -83,7 +83,7 @@ impl Options {
 
     /// Flames in each hard case.
     fn hard_repeats(&self) -> usize {
-        if self.quick { 8 } else { 2 * self.repeats }
+        if self.quick { 8 } else { 4 * self.repeats }
     }
 }
 
@@ -124,7 +124,7 @@ struct Findings {
     speeds: Vec<Speed>,
 }
 
-/// Answers from which a normalised error of one method in one table is a measurement.
+/// Answers from which a normalised error of one method in one table or hard case is a measurement.
 const FEWEST: usize = 20;
 
 /// Steps that [`measure`] ticks off.
@@ -169,7 +169,7 @@ pub fn measure(options: &Options, tick: Tick) -> Result<Report, RangeEvalError> 
 impl Findings {
     fn report(&self, options: &Options) -> Report {
         let mut tables: Vec<Table> = self.tables.iter().flat_map(tables::drawn).collect();
-        tables.push(hardness::drawn(&self.suites));
+        tables.extend(hardness::drawn(&self.suites));
         tables.push(self.drawn_steps());
         tables.push(self.drawn_scenes());
         tables.push(self.drawn_speeds());
@@ -203,6 +203,8 @@ impl Findings {
             .find(|suite| suite.case == Hardness::SaturatedCore);
         let phantom = saturated.and_then(Suite::phantoms_rejected_percent);
         let (lures, lured) = saturated.map_or((None, 0), Suite::lures_rejected_percent);
+        let (hard_worst, hard_on) = hardness::least_honest(&self.suites, 0..OURS, FEWEST);
+        let (hard_best, best_on) = hardness::least_honest(&self.suites, BEST..BEST + 1, FEWEST);
         let best = self.speeds.get(BEST);
         let at_most = |name, value, unit, bound, n| {
             Figure::bounded(name, value, unit, Bound::AtMost(bound), n)
@@ -242,6 +244,20 @@ impl Findings {
                 "",
                 Bound::Within(0.8, 1.2),
                 rested_on,
+            ),
+            Figure::bounded(
+                "range.hard_normalised_error_worst",
+                hard_worst,
+                "",
+                Bound::Within(0.8, 1.2),
+                hard_on,
+            ),
+            Figure::bounded(
+                "range.hard_normalised_error_best",
+                hard_best,
+                "",
+                Bound::Within(0.8, 1.2),
+                best_on,
             ),
             at_least(
                 "range.speedup_1_fire",
