@@ -16,11 +16,11 @@ const RIM_PX: usize = 1;
 /// How its error follows from what it saw.
 const FACTORS: Factors = Factors {
     scatter: 0.16,
-    dull: 3.5,
-    hidden: 0.67,
-    split: 1.06,
-    rise: 0.80,
-    rise_astray: 3.46,
+    dull: 4.0,
+    astray: 4.3,
+    hidden: 0.6,
+    rise: 0.5,
+    rise_astray: 2.4,
     ..PLAIN
 };
 /// The same between two spectra, where grey levels are unlike anyway: a third of it is the flame's doing.

@@ -33,7 +33,7 @@ const FACTORS: Factors = Factors {
     scatter: 0.30,
     dull: 0.62,
     unlike: 1.94,
-    hidden: 1.02,
+    hidden: 1.5,
     split: 2.11,
     moved_astray: 1.70,
     ..PLAIN

@@ -3,7 +3,8 @@
 //! - **Scatter**: noise, and parts of the flame at depths of their own. Each method sees it on the spot, in
 //!   how its parts or bands disagree; neighbours err alike, so that a factor makes one sigma of it.
 //! - **Unlikeness**: where one eye is duller than the other, or shows less of the flame (smoke before it, dirt on
-//!   its lens), what matches is worth less: scatter counts more, the duller and the less alike the eyes are.
+//!   its lens), what matches is worth less: scatter counts more, the duller and the less alike the eyes are, and
+//!   the more of the flame is in parts that do not go with the whole.
 //! - **Motion**: a flame that is seen at two moments has risen in between. Rectified eyes show nothing lower of
 //!   what stands still, so the rise is seen, and what moved up moved sideways as well; the more so where parts of
 //!   the flame do not go with the whole.
@@ -36,7 +37,7 @@ pub(super) struct Matched {
 pub(super) struct Signs {
     /// By what share one eye is duller than the other, 0 to 1.
     pub dullness: f64,
-    /// Between the disparity of the target as one and the mean of its parts, pixels.
+    /// Between the disparity of the target as one and that of its parts or pixels together, pixels.
     pub split_px: f64,
     /// By how much one eye shows it lower than the other, pixels.
     pub rise_px: f64,
@@ -57,9 +58,11 @@ pub(super) struct Factors {
     pub dull: f64,
     /// Of the scatter once more, times likeness that is missing.
     pub unlike: f64,
+    /// Of the scatter once more, times the share that is astray.
+    pub astray: f64,
     /// Of the scatter once more, times what is hidden.
     pub hidden: f64,
-    /// Of how far the parts' mean is from the whole.
+    /// Of how far its parts or pixels together are from the whole.
     pub split: f64,
     /// Of the rise.
     pub rise: f64,
@@ -84,6 +87,7 @@ pub(super) const PLAIN: Factors = Factors {
     scatter: 1.0,
     dull: 0.0,
     unlike: 0.0,
+    astray: 0.0,
     hidden: 0.0,
     split: 0.0,
     rise: 0.0,
@@ -124,6 +128,7 @@ impl Matched {
             by.scatter * self.found.sigma_px,
             by.dull * signs.dullness * self.found.sigma_px,
             by.unlike * unlike * self.found.sigma_px,
+            by.astray * signs.astray * self.found.sigma_px,
             by.hidden * signs.hidden * self.found.sigma_px,
             by.split * signs.split_px,
             by.rise * signs.rise_px,

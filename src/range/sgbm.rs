@@ -3,6 +3,7 @@
 use super::error::{Factors, Matched, PLAIN, Signs};
 use super::patch::Gray;
 use super::pool::{Pooled, Sample, pool};
+use super::refine::{LEAST_ALONG, Refiner};
 use super::scene::{Mask, Scene, Search};
 use super::search::correlate;
 use super::{Disparity, Miss, RangeConfig, RangeError, Refusal};
@@ -45,6 +46,7 @@ impl SemiGlobal {
             return Err(Refusal::Inconsistent.into());
         }
         borne_out(scene, &samples, &pooled, config)?;
+        let beside_px = least_squares(scene, pooled.disparity_px)?;
         let found = Disparity {
             px: pooled.disparity_px,
             sigma_px: UNSETTLED_PX * (1.0 - pooled.agreement).powi(2),
@@ -59,6 +61,7 @@ impl SemiGlobal {
             likeness: 1.0,
             signs: Signs {
                 hidden: scene.hidden_share(),
+                split_px: (beside_px - pooled.disparity_px).abs(),
                 ..Signs::default()
             },
             factors: &FACTORS,
@@ -94,13 +97,17 @@ impl SemiGlobal {
 /// Pixels of error, one sigma, if no two pixels agreed. Neighbours share their errors, so that the spread
 /// of those that agree says little; how many do not agree says more.
 const UNSETTLED_PX: f64 = 6.3;
-/// How its error follows from that: whole pixels pull at its disparities, whatever agrees.
+/// How its error follows from that. Whole pixels pull at its disparities, whatever agrees: least squares at the same
+/// place, which they do not pull at, shows by how much.
 const FACTORS: Factors = Factors {
-    scatter: 1.05,
-    hidden_px: 0.09,
-    least_px: 0.119,
+    scatter: 0.8,
+    split: 0.8,
+    hidden_px: 0.25,
+    least_px: 0.05,
     ..PLAIN
 };
+/// Below the pixel only the flame's own edge counts.
+const RIM_PX: usize = 1;
 /// Share of the flame that must have a valid disparity: where less has, the eyes show it differently.
 const LEAST_COVERED: f64 = 0.5;
 /// Least correlation of what was matched: no gain or offset is made up for pixel by pixel.
@@ -135,6 +142,18 @@ fn borne_out(
     } else {
         Err(Refusal::NoPeak)
     }
+}
+
+/// The disparity of the target as one about the matched one; where its parts do not go with it, the match is of
+/// something else.
+fn least_squares(scene: &Scene<'_>, disparity_px: f64) -> Result<f64, Miss> {
+    let start_px = disparity_px.round() as i32;
+    let right = scene.opposite(-start_px)?;
+    let left = scene.left_like(&right, -start_px)?;
+    let refined = Refiner::new(&left, &right, &scene.weights(RIM_PX), start_px)
+        .and_then(|refiner| refiner.refine(LEAST_ALONG))
+        .ok_or(Refusal::Inconsistent)?;
+    Ok(refined.found.disparity_px)
 }
 
 /// Columns and rows of a mask's pixels.
