@@ -13,7 +13,8 @@
 //!   that was matched.
 //! - **Depth**: what shines lies before and behind the flame's axis, which the disparity is meant for. It
 //!   is the same for every method, so that asking another one does not lessen it.
-//! - **Sampling**: what pixels and interpolation leave, however much is seen.
+//! - **Sampling**: what pixels and interpolation leave, however much is seen. Semi-global matching is pulled
+//!   towards whole pixels; least squares at the same place show by how much.
 //!
 //! Calibration's share stands in the rig. Factors were settled on the tuning set of `emberfix eval range`: those
 //! that make errors most likely and the normalised error of every table and every hard case closest to 1.
