@@ -156,10 +156,10 @@ fn stray<const N: usize>(
 ) {
     let before = receiver.map(|axis| axis.sigmas_m.component_mul(&axis.keeps.add_scalar(-1.0)));
     let mut levers = SMatrix::<f64, N, 3>::zeros();
-    for axis in 0..3 {
+    for (axis, share) in before.iter().enumerate() {
         let old = [from + axis, from + axis + NEW].map(|i| covariance.column(i));
-        levers.column_mut(axis).axpy(before[axis][0], &old[0], 0.0);
-        levers.column_mut(axis).axpy(before[axis][1], &old[1], 1.0);
+        levers.column_mut(axis).axpy(share[0], &old[0], 0.0);
+        levers.column_mut(axis).axpy(share[1], &old[1], 1.0);
     }
     let seen = |i: usize, j: usize| {
         let (wanders, new) = (levers[(from + i, j)], levers[(from + i + NEW, j)]);
@@ -442,6 +442,7 @@ impl Joint {
     /// Returns its squared distance over the numbers that it has: 1 on average.
     pub fn take(&mut self, m: &Measured, at: &JointVector) -> Option<f64> {
         let left = self.left(m, at);
+        #[expect(clippy::op_ref, reason = "by value all of it would be copied")]
         let lever = &self.covariance * m.rows.transpose();
         let spread = m.rows * lever;
         let factor = (spread + m.noise).cholesky()?;
@@ -463,6 +464,7 @@ impl Joint {
 
     /// Takes one number in: `residual = row' (x - at) + noise`.
     pub fn take_one(&mut self, row: &JointVector, residual: f64, variance: f64, at: &JointVector) {
+        #[expect(clippy::op_ref, reason = "by value all of it would be copied")]
         let lever = &self.covariance * row;
         let spread = row.dot(&lever) + variance;
         if spread > 0.0 {
