@@ -23,6 +23,9 @@ const LEAST_SHARE: f64 = 0.01;
 /// nothing hides 0.01 to 0.1 (tuning set of `emberfix eval range`; nine branches in ten and one whole flame in
 /// thirty pass).
 const LEAST_DARK: f64 = 0.12;
+/// What hides is no larger than so many times the flame: branches, with what is around them, seldom exceed twice. More
+/// is a texture of bright and dark grains.
+const MOST_SHARE: f64 = 5.0;
 /// A branch goes on beside the flame: so far, pixels.
 const BESIDE_PX: usize = 5;
 
@@ -55,7 +58,8 @@ pub(super) fn hidden(flame: &Mask, shines: &[i16], dark: i16, target: &Area) -> 
         return None;
     }
     beside(&mut found, flame, shines, dark);
-    Some(found.grown(AROUND_PX))
+    let hidden = found.grown(AROUND_PX);
+    (hidden.count() as f64 <= MOST_SHARE * flame.count() as f64).then_some(hidden)
 }
 
 /// Pixels that thin gaps show: all, and those that are dark.
@@ -177,6 +181,19 @@ mod tests {
             shines[place] = GROUND - i16::from(place % 3 == 0);
         }
         assert!(hidden(&flame, &shines, GROUND, &AREA).is_some());
+    }
+
+    #[test]
+    fn grains_of_a_texture_hide_nothing() {
+        let mut state = 1_u32;
+        let mut grain = || {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            (state >> 24) as i16
+        };
+        let shines: Vec<i16> = (0..SIDE * SIDE).map(|_| grain()).collect();
+        let kept = shines.iter().map(|shine| *shine > 230).collect();
+        let flame = Mask { area: AREA, kept };
+        assert_eq!(hidden(&flame, &shines, 64, &AREA), None);
     }
 
     #[test]
