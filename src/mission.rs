@@ -170,6 +170,7 @@ struct RawModel {
     overlap_px: Option<u32>,
     frame_budget_ms: Option<f64>,
     threads: Option<u32>,
+    second_look: Option<bool>,
 }
 
 #[derive(Deserialize, Default)]
@@ -270,6 +271,7 @@ const KNOWN: &[&str] = &[
     "model.overlap_px",
     "model.frame_budget_ms",
     "model.threads",
+    "model.second_look",
     "right_model.path",
     "right_model.sha256",
     "right_model.family",
@@ -558,7 +560,10 @@ fn build(raw: RawMission, path: &Path) -> Result<Mission, MissionError> {
         .as_deref()
         .map_or_else(|| Path::new(".emberfix").join(&raw.name), beside);
     Ok(Mission {
-        detector: detector(&raw.model, &beside),
+        detector: DetectorConfig {
+            second_look: raw.model.second_look.unwrap_or(true),
+            ..detector(&raw.model, &beside)
+        },
         right_eye: right_eye::right_eye(raw.right_model.as_ref(), raw.fusion.as_ref(), &beside),
         range_method: method(&raw.range).unwrap_or_default(),
         range: range(&raw.range),

@@ -117,6 +117,7 @@ fn fly(near_infrared: bool) -> Flown {
                 height: label.bottom_px - label.top_px,
             },
             mask: None,
+            second_look: None,
         };
         flames.map(detection).collect()
     });

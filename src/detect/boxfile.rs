@@ -125,6 +125,7 @@ fn parse(text: &str) -> Result<BTreeMap<u64, Vec<GivenBox>>, (usize, String)> {
             score: raw.score,
             box_px,
             mask: None,
+            second_look: None,
         };
         boxes.entry(raw.sequence).or_default().push(GivenBox {
             detection,

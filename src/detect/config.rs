@@ -82,6 +82,8 @@ pub struct DetectorConfig {
     pub threads: usize,
     /// What may compute it: the first that takes all of the model does.
     pub providers: Vec<Provider>,
+    /// Whether what it finds is looked at again (light that eyes see only).
+    pub second_look: bool,
     /// Meaning of the model's class names; [`default_classes`](Self::default_classes) covers the
     /// usual ones.
     pub classes: BTreeMap<String, ClassPolicy>,
@@ -104,6 +106,7 @@ impl DetectorConfig {
             frame_budget_ms: None,
             threads: 2,
             providers: vec![Provider::Cpu],
+            second_look: false,
             classes: Self::default_classes(),
         }
     }

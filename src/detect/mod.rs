@@ -8,6 +8,7 @@
 //!   and merges what they see: `preprocess` cuts the views, one file of `family` per model family turns
 //!   tensors into boxes and masks, `nms` makes one box of one flame.
 //!   Where a frame's time is bounded, `attention` says which tiles are worth it.
+//! - `second_look` enlarges what was found and says how sure it is that it burns.
 //! - [`BoxFileDetector`] reads given boxes from a file.
 //!
 //! **Assumptions.** A model file is trusted as far as its hash, its size and its tensors were
@@ -34,6 +35,7 @@ mod nms;
 mod onnx;
 mod preprocess;
 mod runtime;
+mod second_look;
 
 pub use attention::{GroundScale, Looked};
 pub use boxfile::{BoxFileDetector, BoxFileError, GivenBox};
@@ -46,6 +48,7 @@ pub use onnx::{ClassInfo, DetectorInfo, OnnxDetector, Spent};
 
 use emberfix_frames::ServiceTime;
 use opencv::core::Mat;
+use second_look::Twice;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
@@ -151,6 +154,8 @@ pub struct Detection {
     pub box_px: BoxPx,
     /// Which pixels, where the model tells.
     pub mask: Option<Arc<Mask>>,
+    /// Log-odds, by a second look at it alone, that it is what its class says; `None` where nobody looked.
+    pub second_look: Option<f64>,
 }
 
 /// Finds fire and smoke in one image. A miss is an empty list, not an error.
@@ -178,7 +183,11 @@ pub fn open(config: &DetectorConfig) -> Result<Box<dyn Detector>, ModelError> {
         tracing::warn!(provider = provider.name(), %why, "execution provider does not run the model");
     }
     tracing::info!(?info, "model loaded");
-    Ok(Box::new(detector))
+    Ok(if config.second_look {
+        Box::new(Twice::open(detector)?)
+    } else {
+        Box::new(detector)
+    })
 }
 
 /// Why a frame has no result. The next frame may have one: count it and go on.

@@ -174,7 +174,7 @@ fn float_shape(outlet: &Outlet) -> Option<&[i64]> {
 }
 
 /// NaN and infinity have all exponent bits set; integers let the compiler look at many at once.
-fn check_finite(values: &[f32]) -> Result<(), DetectError> {
+pub(super) fn check_finite(values: &[f32]) -> Result<(), DetectError> {
     const EXPONENT: u32 = 0x7f80_0000;
     let bad = |value: &f32| u32::from(value.to_bits() & EXPONENT == EXPONENT);
     match values.iter().map(bad).sum::<u32>() {

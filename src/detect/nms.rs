@@ -47,6 +47,7 @@ pub(super) fn merge(mut candidates: Vec<Candidate>, iou: f64) -> Vec<Detection> 
             score: kept.score,
             box_px: kept.box_px,
             mask: kept.mask.clone(),
+            second_look: None,
         })
         .collect();
     detections.sort_by(|a, b| b.score.total_cmp(&a.score));

@@ -202,6 +202,7 @@ impl Geometry<'_> {
                 height: high.v - low.v,
             },
             mask: own.and_then(|own| own.mask.as_ref().map(Arc::clone)),
+            second_look: own.and_then(|own| own.second_look),
         }
     }
 }

@@ -276,6 +276,7 @@ impl Vision {
             sighting,
             class,
             score: detection.score,
+            second_look: detection.second_look,
             patch: patch(&pair.left_bgr, &detection.box_px),
         })
     }

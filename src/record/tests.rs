@@ -80,6 +80,7 @@ fn record(path: &Path, options: &RecordOptions) {
             score: 0.9,
             box_px,
             mask: None,
+            second_look: None,
         };
         tape.write_detections(exposed, &[detection]).unwrap();
         let fix = serde_json::json!({"type": "Feature", "geometry": null,

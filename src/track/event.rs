@@ -9,7 +9,8 @@
 //!
 //! What tells most is the score, and whether the picture changes its shape ([`Patch::change`]): of things up
 //! to 30 px, flames change by 0.06 to 0.19 from look to look, lanterns, cars, bushes and roofs by 0.01 to
-//! 0.04. A larger box is cut less steadily, and asks for a better score instead. Growth was tried and left
+//! 0.04. A larger box is cut less steadily, and asks for a better score instead; a second look at each box
+//! (`detect::second_look`) tells lamps, cars and trees from flames. Growth was tried and left
 //! out: over the half minute that a fire is looked at, it told flames from other things no better than chance.
 
 use crate::assess::patch::Patch;
@@ -22,6 +23,8 @@ pub struct Look<'a> {
     pub at: ServiceTime,
     /// Detector score, 0..1.
     pub score: f64,
+    /// Log-odds by a second look, where there was one.
+    pub second_look: Option<f64>,
     /// Smoke, not flame.
     pub is_smoke: bool,
     /// What it looks like, where its picture is at hand.
@@ -37,7 +40,7 @@ pub struct Look<'a> {
 }
 
 /// Numbers that the model weighs, the constant among them.
-pub const FEATURES: usize = 7;
+pub const FEATURES: usize = 8;
 /// Their names, in order.
 pub const NAMES: [&str; FEATURES] = [
     "constant",
@@ -47,10 +50,13 @@ pub const NAMES: [&str; FEATURES] = [
     "flicker",
     "smoke",
     "score of a large box",
+    "second look",
 ];
 
-/// Fitted, outside this program, to the same features of 90 flights of seed 102 at threshold 0.35, with the ridge of `--fit`.
-const WEIGHTS: [f64; FEATURES] = [-2.634, 4.636, 0.069, 7.362, 0.527, 2.525, -1.759];
+/// Fitted, outside this program, to the same features of 110 flights of seed 102 at threshold 0.35, with the ridge of
+/// `--fit`: where boxes were looked at twice, and where not (`--no-second-look`).
+const LOOKED_AT_TWICE: [f64; FEATURES] = [-3.781, 1.631, -0.206, 5.359, 2.454, 3.996, 3.726, 2.070];
+const LOOKED_AT_ONCE: [f64; FEATURES] = [-2.768, 5.853, -0.034, 4.513, 1.952, 3.204, -0.292, 0.0];
 
 /// Looks further apart than this say nothing about flicker: the view has changed too, seconds.
 const GAP_S: f64 = 1.5;
@@ -58,6 +64,8 @@ const GAP_S: f64 = 1.5;
 const LEAST_CHANGES: u32 = 3;
 /// Scores beyond are no surer.
 const SCORES: (f64, f64) = (0.02, 0.98);
+/// Log-odds of a second look beyond are no surer.
+const SUREST: f64 = 5.0;
 /// Change of a picture in the middle between flames and what is rigid.
 const USUAL_CHANGE: f64 = 0.045;
 /// A change below is noise, one above is no better sign: the box jumped.
@@ -79,10 +87,11 @@ pub struct Event {
     scores: f64,
     sides: f64,
     is_smoke: bool,
+    second_looks: Mean,
     last_patch: Option<(ServiceTime, Patch)>,
-    shape: Changes,
+    shape: Mean,
     last_light: Option<(ServiceTime, f64)>,
-    light: Changes,
+    light: Mean,
 }
 
 impl Event {
@@ -94,6 +103,9 @@ impl Event {
         let side = look.area_px2.max(1.0).ln() / 2.0 - USUAL_SIDE;
         self.sides += side.clamp(-MOST_SIDE, MOST_SIDE);
         self.is_smoke = look.is_smoke;
+        if let Some(log_odds) = look.second_look {
+            self.second_looks.add(log_odds.clamp(-SUREST, SUREST));
+        }
         self.note_shape(look);
         self.note_light(look);
     }
@@ -133,24 +145,29 @@ impl Event {
     #[must_use]
     pub fn features(&self) -> [f64; FEATURES] {
         let of_looks = |sum: f64| sum / self.hits.max(1.0);
-        let flicker = self.light.mean();
+        let flicker = self.light.mean(LEAST_CHANGES);
         let flicker = flicker.map_or(0.0, |mean| ((LEAST_FLICKER + mean) / USUAL_FLICKER).ln());
         let score = of_looks(self.scores);
         [
             1.0,
             score,
             ((self.hits + 1.0) / (self.misses + 1.0)).ln(),
-            self.shape.mean().unwrap_or(0.0),
+            self.shape.mean(LEAST_CHANGES).unwrap_or(0.0),
             flicker,
             f64::from(u8::from(self.is_smoke)),
             score * of_looks(self.sides),
+            self.second_looks.mean(1).unwrap_or(0.0),
         ]
     }
 
     /// Probability that it is real.
     #[must_use]
     pub fn probability(&self) -> f64 {
-        let terms = self.features().into_iter().zip(WEIGHTS);
+        let weights = match self.second_looks.mean(1) {
+            Some(_) => LOOKED_AT_TWICE,
+            None => LOOKED_AT_ONCE,
+        };
+        let terms = self.features().into_iter().zip(weights);
         let log_odds: f64 = terms.map(|(feature, weight)| feature * weight).sum();
         1.0 / (1.0 + (-log_odds).exp())
     }
@@ -160,21 +177,22 @@ fn is_soon(before: ServiceTime, at: ServiceTime) -> bool {
     (at - before).as_secs_f64() < GAP_S
 }
 
-/// Changes from look to look.
+/// Of what was seen in some looks.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-struct Changes {
+struct Mean {
     count: u32,
     sum: f64,
 }
 
-impl Changes {
-    fn add(&mut self, change: f64) {
+impl Mean {
+    fn add(&mut self, value: f64) {
         self.count = self.count.saturating_add(1);
-        self.sum += change;
+        self.sum += value;
     }
 
-    fn mean(&self) -> Option<f64> {
-        (self.count >= LEAST_CHANGES).then(|| self.sum / f64::from(self.count))
+    /// `None` of fewer than so many.
+    fn mean(&self, least: u32) -> Option<f64> {
+        (self.count >= least).then(|| self.sum / f64::from(self.count))
     }
 }
 
@@ -204,6 +222,7 @@ mod tests {
         event.saw(&Look {
             at: ServiceTime::from_unix_ns(0) + SignedDuration::from_millis(400 * number),
             score,
+            second_look: None,
             is_smoke: false,
             patch: Some(&picture(turn)),
             is_compared: true,

@@ -72,6 +72,8 @@ pub struct Classified {
     pub class: AlarmClass,
     /// Detector score, 0..1.
     pub score: f64,
+    /// Log-odds by a second look at it, where there was one.
+    pub second_look: Option<f64>,
     /// What it looks like, where its picture is at hand.
     pub patch: Option<Patch>,
 }
@@ -196,7 +198,7 @@ const MAX_RELATIVE_SIGMA: f64 = 0.2;
 /// Horizontal sigma that is good enough from however near, metres.
 const NEAR_ENOUGH_M: f64 = 5.0;
 /// A fire is told from this probability of its being one.
-const LIKELY: f64 = 0.7;
+const LIKELY: f64 = 0.85;
 /// A fire counts as missed from up to this many times the range that it was seen from.
 const MISS_REACH: f64 = 1.1;
 /// How far the clock error's spread is looked over, in its sigmas and at most, seconds.
@@ -479,6 +481,7 @@ impl Tracker {
                 fire.event.saw(&event::Look {
                     at: sighting.at,
                     score: classified.score,
+                    second_look: classified.second_look,
                     is_smoke: classified.class == AlarmClass::Smoke,
                     patch: classified.patch.as_ref(),
                     is_compared: is_compared(fire.evidence.hits(), fire.id, pictured),

@@ -176,6 +176,7 @@ impl Flight {
             },
             class: AlarmClass::Fire,
             score: 0.8,
+            second_look: None,
             patch: None,
         })
     }

@@ -72,13 +72,7 @@ pub(super) fn label(
     lens: &Lens,
     solids: &Solids,
 ) -> Option<LabelMask> {
-    let kept = |splat: &&Splat| splat.kind != SplatKind::Light;
-    let all: Vec<(&Splat, SeenSplat)> = burning
-        .splats
-        .iter()
-        .filter(kept)
-        .filter_map(|splat| SeenSplat::new(splat, pose, lens).map(|seen| (splat, seen)))
-        .collect();
+    let all = splats(burning, pose, lens);
     let visible: Vec<SeenSplat> = all
         .iter()
         .filter(|(splat, seen)| is_free(splat, seen, world, pose, solids))
@@ -87,7 +81,36 @@ pub(super) fn label(
     if visible.is_empty() || (visible.len() as f64) < (1.0 - MOST_HIDDEN) * all.len() as f64 {
         return None;
     }
-    let raster = Raster::of(&visible, world, visible_alpha(burning.class))?;
+    outlined(burning, &visible, world)
+}
+
+/// The same of all that is before the lens, whatever stands between.
+pub(super) fn unhidden(
+    burning: &Burning,
+    world: &World,
+    pose: &EyePose,
+    lens: &Lens,
+) -> Option<LabelMask> {
+    let all: Vec<SeenSplat> = splats(burning, pose, lens)
+        .into_iter()
+        .map(|(_, seen)| seen)
+        .collect();
+    outlined(burning, &all, world)
+}
+
+fn splats<'a>(burning: &'a Burning, pose: &EyePose, lens: &Lens) -> Vec<(&'a Splat, SeenSplat)> {
+    let kept = |splat: &&Splat| splat.kind != SplatKind::Light;
+    let seen = |splat: &'a Splat| SeenSplat::new(splat, pose, lens).map(|seen| (splat, seen));
+    burning
+        .splats
+        .iter()
+        .filter(kept)
+        .filter_map(seen)
+        .collect()
+}
+
+fn outlined(burning: &Burning, seen: &[SeenSplat], world: &World) -> Option<LabelMask> {
+    let raster = Raster::of(seen, world, visible_alpha(burning.class))?;
     let extent = raster.extent()?;
     let (width, height) = (extent.2 - extent.0, extent.3 - extent.1);
     (width >= SMALLEST_PX && height >= SMALLEST_PX).then_some(LabelMask {

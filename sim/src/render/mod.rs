@@ -176,7 +176,19 @@ impl Renderer {
         masks.into_iter().map(|mask| mask.label).collect()
     }
 
-    /// The same with their pixels.
+    /// Around all that burns before the lens, hidden or not, as if nothing stood between.
+    #[must_use]
+    pub fn burning_boxes(&self, body: &BodyState, t_s: f64) -> Vec<LabelBox> {
+        let (lens, pose) = (
+            self.camera.lens(Eye::Left),
+            self.camera.pose(Eye::Left, body),
+        );
+        let label = |burning: &Burning| labels::unhidden(burning, &self.world, &pose, lens);
+        let masks = self.world.burning(t_s);
+        masks.iter().filter_map(label).map(|m| m.label).collect()
+    }
+
+    /// The same as [`label_boxes`](Self::label_boxes), with their pixels.
     #[must_use]
     pub fn label_masks(&self, body: &BodyState, t_s: f64) -> Vec<LabelMask> {
         let (lens, pose) = (

@@ -66,6 +66,9 @@ pub struct DetectorArguments {
     /// report uses.
     #[arg(long)]
     fit: bool,
+    /// With `events`: nothing is looked at twice.
+    #[arg(long)]
+    no_second_look: bool,
     /// With `spectra`: the right eye's model, if it is another.
     #[arg(long, value_name = "MODEL")]
     right_model: Option<PathBuf>,
@@ -135,7 +138,10 @@ fn in_pictures(arguments: &DetectorArguments, model: DetectorConfig) -> Result<(
 
 fn over_flights(arguments: &DetectorArguments, model: DetectorConfig) -> Result<(), Failure> {
     let options = events::Options {
-        model,
+        model: DetectorConfig {
+            second_look: !arguments.no_second_look,
+            ..model
+        },
         flights: arguments.flights,
         seed: arguments.seed,
     };

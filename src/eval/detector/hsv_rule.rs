@@ -80,6 +80,7 @@ fn pieces(kept: &Mat) -> opencv::Result<Vec<Detection>> {
                     height,
                 },
                 mask: None,
+                second_look: None,
             });
         }
     }

@@ -287,6 +287,7 @@ fn classified(seen: &Seen, errors: &ErrorModel, at: ServiceTime) -> Classified {
         },
         class: AlarmClass::Fire,
         score: 0.8,
+        second_look: None,
         patch: seen.picture,
     }
 }

@@ -90,6 +90,7 @@ impl Scene<'_> {
                 sighting: self.sighting(&view)?,
                 class: AlarmClass::Fire,
                 score: 0.9,
+                second_look: None,
                 patch: None,
             };
             tracker.step(&view, &[seen], Some(&self.ground));

@@ -30,8 +30,8 @@ pub fn weights<'a>(tracks: impl Iterator<Item = &'a Tracked>) -> [f64; FEATURES]
         .flat_map(|track| {
             let asked = asked(track);
             let share = 1.0 / asked.len().max(1) as f64;
-            let truth = f64::from(u8::from(track.burns));
-            let sample = move |moment: &&Moment| (moment.features.into(), truth, share);
+            let truth = |moment: &Moment| f64::from(u8::from(moment.burns));
+            let sample = move |moment: &&Moment| (moment.features.into(), truth(moment), share);
             asked.iter().map(sample).collect::<Vec<_>>()
         })
         .collect();
@@ -65,13 +65,13 @@ mod tests {
             (features[0], features[1]) = (1.0, side);
             Tracked {
                 burns,
-                truth: Vec::new(),
-                told: false,
+                told: None,
                 nearest: None,
                 moments: vec![Moment {
                     hits: 8,
                     features,
                     probability: 0.0,
+                    burns,
                 }],
             }
         };

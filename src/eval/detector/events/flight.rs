@@ -48,6 +48,8 @@ pub struct Moment {
     pub features: [f64; FEATURES],
     /// What the model said.
     pub probability: f64,
+    /// Whether most of its sightings so far were of something that burns.
+    pub burns: bool,
 }
 
 /// One track of a flight.
@@ -55,10 +57,9 @@ pub struct Moment {
 pub struct Tracked {
     /// Whether most of its sightings were of something that burns.
     pub burns: bool,
-    /// What, where it does: one box may hold two fires.
-    pub truth: Vec<usize>,
-    /// Whether it was told.
-    pub told: bool,
+    /// What burned where most of its sightings were when it was told, if it was: one box may hold two fires, and
+    /// where there is none, that was a false incident.
+    pub told: Option<Vec<usize>>,
     /// The lookalike that it was placed nearest to, and how far off, metres.
     pub nearest: Option<(LookalikeKind, f64)>,
     /// Look by look.
@@ -151,7 +152,8 @@ pub fn fly(
                 }
             })
             .collect();
-        book.note(&labels, &found, tracker.fires());
+        let burning = renderer.burning_boxes(&body, t_s);
+        book.note(&labels, &burning, &found, tracker.fires());
     }
     Ok(book.closed(looks as f64 / LOOKS_HZ, &scene))
 }
@@ -251,14 +253,15 @@ struct Page {
     wrong: u32,
     /// Of each thing that burns.
     of: BTreeMap<usize, u32>,
-    told: bool,
+    told: Option<Vec<usize>>,
     /// Where it was last.
     position_m: Vector3<f64>,
     moments: Vec<Moment>,
 }
 
 impl Book {
-    fn note(&mut self, labels: &[LabelBox], found: &[Found], fires: &[Fire]) {
+    /// `labels` are what can be seen, `burning` is all that burns: a place that burns is one whose flame is hidden too.
+    fn note(&mut self, labels: &[LabelBox], burning: &[LabelBox], found: &[Found], fires: &[Fire]) {
         let flames = labels
             .iter()
             .filter(|label| label.class == BurningClass::Fire);
@@ -269,8 +272,8 @@ impl Book {
             *seen += usize::from(found.iter().any(|one| overlaps(label, one)));
         }
         for one in found {
-            let burning: BTreeSet<usize> = labels
-                .iter()
+            let all = labels.iter().chain(burning);
+            let burning: BTreeSet<usize> = all
                 .filter(|label| overlaps(label, one))
                 .map(|label| label.fire)
                 .collect();
@@ -290,6 +293,7 @@ impl Book {
                     hits: fire.evidence.hits(),
                     features: fire.event.features(),
                     probability: fire.event.probability(),
+                    burns: page.burns(),
                 });
             }
         }
@@ -297,7 +301,10 @@ impl Book {
             .iter()
             .filter(|fire| fire.is_confirmed() && fire.merged_into.is_none())
         {
-            self.tracks.entry(fire.id).or_default().told = true;
+            let page = self.tracks.entry(fire.id).or_default();
+            if page.told.is_none() {
+                page.told = Some(page.truth());
+            }
         }
     }
 
@@ -311,7 +318,8 @@ impl Book {
             width_px: width / visible as f64,
             told: tracks
                 .iter()
-                .any(|track| track.told && track.truth.contains(&fire)),
+                .filter_map(|track| track.told.as_ref())
+                .any(|told| told.contains(&fire)),
         };
         let fires = self
             .fires
@@ -327,12 +335,21 @@ impl Book {
 }
 
 impl Page {
+    fn burns(&self) -> bool {
+        2 * self.wrong <= self.sightings
+    }
+
+    /// What half of its sightings so far were of, or most; nothing where most were of what does not burn.
+    fn truth(&self) -> Vec<usize> {
+        let most = self.of.values().max();
+        let is_it = |n: &u32| 2 * n >= self.sightings || (self.burns() && Some(n) == most);
+        let truth = self.of.iter().filter(|(_, n)| is_it(n));
+        truth.map(|(fire, _)| *fire).collect()
+    }
+
     fn closed(self, scene: &Scene) -> Tracked {
-        let most = |n: u32| 2 * n > self.sightings;
-        let truth = self.of.iter().filter(|(_, n)| most(**n));
         Tracked {
-            burns: !most(self.wrong),
-            truth: truth.map(|(fire, _)| *fire).collect(),
+            burns: self.burns(),
             told: self.told,
             nearest: scene.nearest(&self.position_m),
             moments: self.moments,

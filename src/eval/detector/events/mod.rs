@@ -127,7 +127,7 @@ fn tenths(flown: &[Flown]) -> Vec<Tenth> {
     let said: Vec<(f64, bool)> = tracks
         .flat_map(|track| {
             let asked = fit::asked(track).into_iter();
-            asked.map(|moment| (moment.probability, track.burns))
+            asked.map(|moment| (moment.probability, moment.burns))
         })
         .collect();
     let tenth = |number: usize| {
@@ -145,11 +145,12 @@ fn report(options: &Options, flown: &[Flown]) -> Report {
     let hours = flown.iter().map(|flown| flown.flown_s).sum::<f64>() / 3600.0;
     let fires: Vec<&There> = flown.iter().flat_map(|flown| &flown.fires).collect();
     let told = fires.iter().filter(|fire| fire.told).count();
-    let is_false = |track: &&Tracked| track.told && !track.burns;
+    let told_of = |track: &Tracked| track.told.as_ref().map(Vec::len);
+    let is_false = |track: &&Tracked| told_of(track) == Some(0);
     let tracks = || flown.iter().flat_map(|flown| &flown.tracks);
     let false_incidents = tracks().filter(is_false).count();
     let twice = tracks()
-        .filter(|track| track.told && track.burns)
+        .filter(|track| told_of(track).is_some_and(|fires| fires > 0))
         .count()
         .saturating_sub(told);
     let visible: usize = fires.iter().map(|fire| fire.visible).sum();
@@ -235,7 +236,6 @@ fn looked_at(flown: &[Flown]) -> Vec<serde_json::Value> {
             serde_json::json!({
                 "flight": flight,
                 "burns": track.burns,
-                "truth": track.truth,
                 "told": track.told,
                 "nearest": track.nearest,
                 "last": track.moments.last(),
