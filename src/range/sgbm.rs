@@ -105,7 +105,7 @@ const UNSETTLED_PX: f64 = 6.3;
 const FACTORS: Factors = Factors {
     scatter: 0.8,
     split: 0.8,
-    hidden_px: 0.25,
+    hidden_px: 0.17,
     least_px: 0.05,
     ..PLAIN
 };
