@@ -45,10 +45,10 @@ pub use family::Family;
 pub use mask::Mask;
 pub use network::{PassedOver, Provider};
 pub use onnx::{ClassInfo, DetectorInfo, OnnxDetector, Spent};
+pub use second_look::Twice;
 
 use emberfix_frames::ServiceTime;
 use opencv::core::Mat;
-use second_look::Twice;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 

@@ -34,7 +34,7 @@ const ANSWERS: usize = 2;
 const LOOKED_AT: usize = 64;
 
 /// A detector whose finds are looked at again.
-pub(super) struct Twice<D> {
+pub struct Twice<D> {
     detector: D,
     session: Session,
     tensor: Vec<f32>,
@@ -42,6 +42,9 @@ pub(super) struct Twice<D> {
 
 impl<D: Detector> Twice<D> {
     /// A second look on one thread.
+    ///
+    /// # Errors
+    /// [`ModelError`] when ONNX Runtime is missing or refuses the network.
     pub fn open(detector: D) -> Result<Self, ModelError> {
         let refused = |source: ort::Error| ModelError::Unsupported {
             path: PathBuf::from("ember-look (a part of this program)"),
@@ -136,15 +139,8 @@ fn put(picture: &Mat, tensor: &mut Vec<f32>) -> opencv::Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::eval::detector::events::{RightEye, rig};
-    use emberfix_calib::Eye;
     use emberfix_frames::ServiceTime;
-    use emberfix_sim::render::{RenderConfig, Renderer, StereoCamera};
-    use emberfix_sim::state::BodyState;
-    use emberfix_sim::world::{FireConfig, LookalikeConfig, LookalikeKind, World, WorldConfig};
-    use nalgebra::{Matrix3, Vector3};
-    use opencv::core::MatTraitConst;
-    use std::sync::Arc;
+    use opencv::core::{CV_8UC3, Scalar};
 
     /// Says the same of every image.
     struct Always(Vec<Detection>);
@@ -155,109 +151,29 @@ mod tests {
         }
     }
 
-    fn fire_at(box_px: BoxPx) -> Detection {
-        Detection {
-            class: DetectionClass::Fire,
+    #[test]
+    fn of_a_crowd_the_best_are_looked_at_wherever_they_stand() {
+        let far_outside = Detection {
+            class: DetectionClass::Smoke,
             score: 0.6,
-            box_px,
+            box_px: BoxPx {
+                x: 1e4,
+                y: -1e4,
+                width: 3.0,
+                height: 900.0,
+            },
             mask: None,
             second_look: None,
-        }
-    }
-
-    /// What stands in the middle of the ground from 30 m, 30 degrees down.
-    fn picture(config: &WorldConfig) -> LeftImage {
-        let world = Arc::new(World::new(config, 5).unwrap());
-        let camera = StereoCamera::new(&rig(RightEye::Visible).unwrap());
-        let renderer = Renderer::new(world, camera, RenderConfig::default());
-        let (sin, cos) = 30.0_f64.to_radians().sin_cos();
-        #[rustfmt::skip]
-        let enu_from_body = Matrix3::new(
-            0.0, 1.0, 0.0,
-            1.0, 0.0, 0.0,
-            0.0, 0.0, -1.0,
-        );
-        let body = BodyState {
-            t_s: 100.0,
-            position_m: Vector3::new(0.0, -30.0 * cos, 30.0 * sin),
-            enu_from_body,
-            velocity_m_s: Vector3::zeros(),
-            rate_rad_s: Vector3::zeros(),
         };
-        let frame = renderer.render(Eye::Left, &body, body.t_s);
-        let bytes = Mat::from_slice(&frame.bytes).unwrap().clone_pointee();
-        LeftImage {
+        let mut detector = Twice::open(Always(vec![far_outside; LOOKED_AT + 3])).unwrap();
+        let grey = Scalar::all(90.0);
+        let found = detector.detect(&LeftImage {
             at: ServiceTime::from_unix_ns(0),
             sequence: 0,
-            bgr: bytes.reshape(3, 416).unwrap().clone_pointee(),
+            bgr: Mat::new_rows_cols_with_default(48, 64, CV_8UC3, grey).unwrap(),
             ground: None,
-        }
-    }
-
-    fn judged(config: &WorldConfig, side_px: f64) -> f64 {
-        let box_px = BoxPx {
-            x: 208.0 - side_px / 2.0,
-            y: 208.0 - 0.8 * side_px,
-            width: side_px,
-            height: side_px,
-        };
-        let mut detector = Twice::open(Always(vec![fire_at(box_px)])).unwrap();
-        let found = detector.detect(&picture(config)).unwrap();
-        found[0].second_look.unwrap()
-    }
-
-    #[test]
-    fn a_flame_is_told_from_a_lantern_and_from_a_car() {
-        let fire = FireConfig {
-            name: "fire".to_owned(),
-            east_m: 0.0,
-            north_m: 0.0,
-            width_m: 1.2,
-            height_m: 1.5,
-            smoke: false,
-            ignites_at_s: -60.0,
-            growth_m_s: 0.0,
-        };
-        let burning = judged(
-            &WorldConfig {
-                fires: vec![fire],
-                ..WorldConfig::default()
-            },
-            40.0,
-        );
-        let not_burning = |kind, size_m, side_px| {
-            let thing = LookalikeConfig {
-                kind,
-                east_m: 0.0,
-                north_m: 0.0,
-                size_m,
-            };
-            let lookalikes = vec![thing];
-            judged(
-                &WorldConfig {
-                    lookalikes,
-                    ..WorldConfig::default()
-                },
-                side_px,
-            )
-        };
-        let lantern = not_burning(LookalikeKind::Lantern, 0.5, 24.0);
-        let car = not_burning(LookalikeKind::OrangeVehicle, 4.0, 100.0);
-        assert!(burning > 0.0, "{burning}");
-        assert!(lantern < 0.0 && car < 0.0, "lantern {lantern}, car {car}");
-    }
-
-    #[test]
-    fn of_a_crowd_the_best_are_looked_at() {
-        let box_px = BoxPx {
-            x: 1e4,
-            y: -1e4,
-            width: 3.0,
-            height: 900.0,
-        };
-        let crowd = vec![fire_at(box_px); LOOKED_AT + 3];
-        let mut detector = Twice::open(Always(crowd)).unwrap();
-        let found = detector.detect(&picture(&WorldConfig::default())).unwrap();
+        });
+        let found = found.unwrap();
         let looked_at = found.iter().filter(|one| one.second_look.is_some()).count();
         assert_eq!((found.len(), looked_at), (LOOKED_AT + 3, LOOKED_AT));
     }

@@ -16,6 +16,8 @@ mod hsv_rule;
 mod overhead;
 mod report;
 pub mod scores;
+#[cfg(test)]
+mod second_look;
 pub mod spectra;
 pub mod tiling;
 
