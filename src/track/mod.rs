@@ -197,8 +197,9 @@ const ROOM: usize = 256;
 const MAX_RELATIVE_SIGMA: f64 = 0.2;
 /// Horizontal sigma that is good enough from however near, metres.
 const NEAR_ENOUGH_M: f64 = 5.0;
-/// A fire is told from this probability of its being one.
-const LIKELY: f64 = 0.85;
+/// A fire is told from this probability of its being one; smoke alone, which fog looks like, from this.
+const LIKELY: f64 = 0.7;
+const LIKELY_SMOKE: f64 = 0.95;
 /// A fire counts as missed from up to this many times the range that it was seen from.
 const MISS_REACH: f64 = 1.1;
 /// How far the clock error's spread is looked over, in its sigmas and at most, seconds.
@@ -575,13 +576,21 @@ fn advance(fire: &mut Fire, config: &TrackConfig, is_another: bool) {
                 && is_another
                 && fire.evidence.is_convincing()
                 && fire.is_located()
-                && fire.event.probability() >= LIKELY
+                && fire.event.probability() >= likely(fire.class)
                 && !fire.flicker.may_be_lamp(fire.size_m, fire.evidence.hits()) =>
         {
             fire.state = FireState::Confirmed;
         }
         FireState::Out if fire.evidence.is_convincing() => fire.state = FireState::Confirmed,
         _ => {}
+    }
+}
+
+/// From which probability it is told.
+fn likely(class: AlarmClass) -> f64 {
+    match class {
+        AlarmClass::Smoke => LIKELY_SMOKE,
+        _ => LIKELY,
     }
 }
 
