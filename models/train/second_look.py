@@ -109,7 +109,7 @@ def samples(pictures: list[data.Picture], detector: Detector, seed: int) -> tupl
             if (cls == 1 and not p.smoke) or min(box[2:] - box[:2]) < 4:
                 continue
             cuts.append(cut(p.image, box))
-            rows.append((cls, burns(cls, box, p.boxes), not p.name.startswith(("synth", "sim"))))
+            rows.append((cls, burns(cls, box, p.boxes), p.name.split("/")[0] in data.RGB_SETS))
     return np.array(cuts), np.array(rows, np.int64).reshape(-1, 3)
 
 
